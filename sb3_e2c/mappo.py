@@ -1,0 +1,544 @@
+"""MAPPO with optional cost constraints (Alg. 2), and E2C-MAPPO.
+
+    env.step ─► o' (S, D), r (S,), infos["cost"]       Alg. 2 l. 5-7
+      callbacks may edit r in place                    Alg. 1 (OEMRewardCallback)
+      TeamRolloutBuffer.add ... finish                 critics, GAE for r and every cost, l. 12
+    train:  λ ← multipliers.update(J − l)              l. 11, Eq. 7
+            Ã = A_r − Σ λⱼ A_cⱼ, clipped surrogate     l. 13, Eq. 8
+            regression of all critics                  l. 14, 16
+
+Shapes: T steps, W worlds, N agents, S = W·N slots (slot = world·N + agent), D observation size,
+K constrained parties (1: the team, N: each agent), M constraints.
+"""
+
+import pathlib
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+
+from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples, minibatches
+from sb3_e2c.callbacks import OEMRewardCallback
+from sb3_e2c.constraints import (
+    CostScope,
+    check_cost_scope,
+    n_parties,
+    parse_cost_limits,
+    party_limits,
+    violation,
+)
+from sb3_e2c.losses import approx_kl, clip_fraction, normalize, policy_loss, value_loss
+from sb3_e2c.monitor import TeamMonitor
+from sb3_e2c.multipliers import GradientMultipliers, Multipliers
+from sb3_e2c.policies import TeamPolicy
+from sb3_e2c.recorder import TeamRecorder
+from sb3_e2c.saving import atomic_write
+from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
+
+
+class MAPPO(PPO):
+    """Multi-agent PPO with parameter sharing, a centralized critic and optional cost constraints.
+
+    Papers: Yu et al. 2022 (MAPPO); Aydeniz et al. 2025, "Safe Multiagent Coordination via Entropic
+    Exploration" (constraints of a team or of its agents). Arguments that are not listed here are
+    those of Stable-Baselines3's PPO; a step is one agent's step, as a row is in Stable-Baselines3.
+
+    :param policy: "MlpPolicy", or a subclass of :class:`sb3_e2c.policies.TeamPolicy`
+    :param env: What :func:`sb3_e2c.share_parameters` returns. A PettingZoo parallel environment
+        becomes one world; a single-agent environment is a team of one
+    :param learning_rate: Of the actor, and of the critics unless they have their own
+    :param n_steps: Steps of each world in a rollout; a multiple of the episode length is best
+    :param batch_size: Largest minibatch in agent steps; whole team steps are drawn, and minibatches
+        of a rollout have nearly equal sizes
+    :param cost_limits: Limit(s) on the team's undiscounted cost of an episode, one for each cost
+        that the environment reports in ``info["cost"]``; None or [] is plain MAPPO
+    :param cost_scope: "team": one multiplier and a joint cost critic for each limit; "individual":
+        every agent has its own, on local observations, with the limit divided by N (Sec. 4.1)
+    :param cost_gamma: Discount of the costs; None: ``gamma``
+    :param multipliers_class: ``GradientMultipliers`` or ``PIDMultipliers``
+    :param multipliers_kwargs: Its arguments, except the shape
+    :param reward_scale: Factor on the environment's reward for learning; never on what is reported
+    :param critic_learning_rate: Of all critics, also as a schedule; None: ``learning_rate``
+    :param normalize_values: Standardize the targets of the critics by their running mean and
+        standard deviation, for the reward and each cost separately
+    :raises ValueError: for limits or a scope that make no sense, or a batch smaller than a team
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TeamPolicy}
+    policy: TeamPolicy
+    rollout_buffer: TeamRolloutBuffer
+    multipliers: Multipliers
+    clip_range: FloatSchedule
+    clip_range_vf: FloatSchedule | None
+
+    def __init__(
+        self,
+        policy: str | type[TeamPolicy],
+        env: GymEnv | ParallelEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        cost_limits: float | Sequence[float] | None = None,
+        cost_scope: CostScope = "team",
+        cost_gamma: float | None = None,
+        multipliers_class: type[Multipliers] = GradientMultipliers,
+        multipliers_kwargs: dict[str, Any] | None = None,
+        reward_scale: float = 1.0,
+        critic_learning_rate: float | Schedule | None = None,
+        normalize_values: bool = False,
+        target_kl: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        check_cost_scope(cost_scope)
+        self.cost_limits = parse_cost_limits(cost_limits)
+        self.cost_scope = cost_scope
+        self.cost_gamma = cost_gamma
+        self.multipliers_class = multipliers_class
+        self.multipliers_kwargs = multipliers_kwargs or {}
+        self.reward_scale = reward_scale
+        self.critic_learning_rate = critic_learning_rate
+        self.normalize_values = normalize_values
+        # PPO's own constructor would only add checks on minibatches of rows, which are not ours.
+        OnPolicyAlgorithm.__init__(
+            self,
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            _init_setup_model=False,
+            supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete),
+        )
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.clip_range = FloatSchedule(clip_range)
+        self.clip_range_vf = None if clip_range_vf is None else FloatSchedule(clip_range_vf)
+        self.normalize_advantage = normalize_advantage
+        self.target_kl = target_kl
+        self.agents = _agents(self.env)
+        self.critic_state_dim = getattr(self.env, "critic_state_dim", 0)
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ construction
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, ParallelEnv):
+            world = env
+            env = share_parameters(lambda: world, n_worlds=1)
+        wrapped = OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if isinstance(wrapped.unwrapped, MultiAgentVecEnv):
+            if not is_vecenv_wrapped(wrapped, TeamMonitor):
+                wrapped = TeamMonitor(wrapped)
+        elif "supersuit" in type(wrapped.unwrapped).__module__:
+            raise TypeError(
+                "env is SuperSuit's own vector environment, which does not say how many agents "
+                "share a world; use sb3_e2c.share_parameters(make_env, n_worlds=...) instead"
+            )
+        return wrapped
+
+    @property
+    def n_agents(self) -> int:
+        """Number of agents N in a team."""
+        return len(self.agents)
+
+    def _setup_model(self) -> None:
+        self._check_setup()
+        parties = n_parties(self.cost_scope, self.n_agents)
+        sizes = {
+            "n_agents": self.n_agents,
+            "n_parties": parties,
+            "n_constraints": len(self.cost_limits),
+            "critic_state_dim": self.critic_state_dim,
+        }
+        self._setup_schedules()
+        self.rollout_buffer_class = TeamRolloutBuffer
+        self.rollout_buffer_kwargs = {
+            **sizes,
+            "cost_gamma": self.gamma if self.cost_gamma is None else self.cost_gamma,
+        }
+        user_kwargs = self.policy_kwargs
+        self.policy_kwargs = {
+            **user_kwargs,
+            **sizes,
+            "critic_lr_schedule": self.critic_lr_schedule,
+        }
+        OnPolicyAlgorithm._setup_model(self)
+        self.policy_kwargs = user_kwargs
+        shape = (parties, len(self.cost_limits))
+        self.multipliers = self.multipliers_class(shape, **self.multipliers_kwargs).to(self.device)
+        self._party_limits = party_limits(self.cost_limits, parties)
+
+    def _setup_schedules(self) -> None:
+        self.clip_range = FloatSchedule(self.clip_range)
+        if self.clip_range_vf is not None:
+            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        own = self.critic_learning_rate
+        self.critic_lr_schedule: Schedule | None = None if own is None else FloatSchedule(own)
+
+    def _check_setup(self) -> None:
+        if self.batch_size < self.n_agents:
+            raise ValueError(
+                f"batch_size is {self.batch_size}, smaller than the team of {self.n_agents} "
+                "agents; a minibatch holds whole team steps, so raise batch_size"
+            )
+        self._check_team()
+
+    def _check_team(self) -> None:
+        if self.env is not None and _agents(self.env) != self.agents:
+            raise ValueError(
+                f"the environment has the agents {_agents(self.env)}, but the model was made for "
+                f"{self.agents}; use an environment with the same team"
+            )
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Use another environment with the same team; see ``PPO.set_env``."""
+        super().set_env(env, force_reset)
+        self._check_team()
+
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+        last_obs = self._last_obs
+        result = super()._setup_learn(total_timesteps, *args, **kwargs)
+        if self._last_obs is not last_obs:  # the environment was reset
+            self._start_episodes()
+        return result
+
+    def _start_episodes(self) -> None:
+        env = self.env
+        assert env is not None
+        self._recorder = TeamRecorder(
+            self.agents,
+            n_worlds=env.num_envs // self.n_agents,
+            n_constraints=len(self.cost_limits),
+            cost_scope=self.cost_scope,
+            team_cost=getattr(env, "team_cost", "sum"),
+            critic_state_dim=self.critic_state_dim,
+        )
+        self._recorder.start(self._last_obs, env.unwrapped.reset_infos)  # type: ignore[arg-type]
+
+    # ------------------------------------------------------------------ collecting
+
+    def collect_rollouts(  # type: ignore[override]
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: TeamRolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the rollout buffer with the current policy (Alg. 2 l. 3-8, 12).
+
+        Keeps Stable-Baselines3's contract with callbacks, and states one more of it: ``rewards``
+        in the locals is the array from which the learner learns; a callback may edit it in place
+        in ``_on_step``. There are no ``values`` and ``log_probs`` in the locals: all networks but
+        the actor are evaluated after the last step, in one batch.
+
+        :param env: The training environment
+        :param callback: Called at each step, and at the beginning and end of the rollout
+        :param rollout_buffer: Buffer to fill
+        :param n_rollout_steps: Steps of each world
+        :return: False if a callback stopped the training
+        """
+        assert self._last_obs is not None, "no previous observation: learn() resets first"
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        recorder = self._recorder
+        recorder.finished_costs.clear()
+        callback.on_rollout_start()
+        for _ in range(n_rollout_steps):
+            actions = self._sample_actions(self._last_obs)
+            clipped_actions = self._clip_actions(actions)
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+            assert isinstance(new_obs, np.ndarray)
+            rewards = self.reward_scale * rewards
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            recorder.record(
+                rollout_buffer,
+                last_obs=self._last_obs,  # type: ignore[arg-type]
+                episode_starts=self._last_episode_starts,  # type: ignore[arg-type]
+                actions=actions,
+                rewards=rewards,
+                new_obs=new_obs,
+                dones=dones,
+                infos=infos,
+                reset_infos=env.unwrapped.reset_infos,
+            )
+            self._last_obs, self._last_episode_starts = new_obs, dones
+        last_obs = np.asarray(self._last_obs)
+        rollout_buffer.finish(self.policy, last_obs, recorder.critic_states)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _sample_actions(self, obs: Any) -> np.ndarray:
+        with th.no_grad():
+            tensor, _ = self.policy.obs_to_tensor(obs)
+            actions = self.policy.get_distribution(tensor).get_actions(deterministic=False)
+        return actions.cpu().numpy().reshape(len(obs), *self.action_space.shape)  # type: ignore[misc]
+
+    def _clip_actions(self, actions: np.ndarray) -> np.ndarray:
+        if isinstance(self.action_space, spaces.Box):
+            return np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self) -> None:
+        """Update multipliers, policy and critics from the last rollout (Alg. 2 l. 11-16)."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        self._update_multipliers()  # l. 11
+        samples = self.rollout_buffer.samples(
+            self.policy, self.multipliers.values, self.normalize_values
+        )
+        logs: dict[str, list[float]] = defaultdict(list)
+        for epoch in range(self.n_epochs):
+            logs["approx_kl"].clear()  # as in PPO, only the last epoch's
+            within_kl = self._train_epoch(samples, logs)
+            self._n_updates += 1
+            if not within_kl:
+                if self.verbose >= 1:
+                    print(f"Early stopping at epoch {epoch}: KL {logs['approx_kl'][-1]:.4f}")
+                break
+        self._log_training(logs)
+
+    def _train_epoch(self, samples: TeamSamples, logs: dict[str, list[float]]) -> bool:
+        """One pass over the rollout (Alg. 2 l. 13-16).
+
+        :return: False if the policy has moved further than ``target_kl`` allows
+        """
+        for batch in minibatches(samples, self.batch_size // self.n_agents):
+            loss, kl = self._loss(batch, logs)
+            if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                return False
+            self._gradient_step(loss)
+        return True
+
+    def _loss(self, batch: TeamSamples, logs: dict[str, list[float]]) -> tuple[th.Tensor, float]:
+        clip_range = self.clip_range(self._current_progress_remaining)
+        new = self.policy.evaluate_steps(batch.observations, batch.actions, batch.critic_states)
+        advantages = batch.advantages
+        if self.normalize_advantage:
+            advantages = normalize(advantages)
+        log_ratio = new.log_prob - batch.old_log_prob
+        ratio = th.exp(log_ratio)  # q of Eq. 8
+        actor = policy_loss(ratio, advantages, clip_range)  # l. 13, Eq. 8
+        value, cost_value = self._value_losses(new.values, new.cost_values, batch)  # l. 14, 16
+        entropy = -new.entropy.mean()
+        loss = actor + self.ent_coef * entropy + self.vf_coef * (value + cost_value)
+        with th.no_grad():
+            kl = approx_kl(log_ratio).item()
+            logs["policy_gradient_loss"].append(actor.item())
+            logs["value_loss"].append(value.item())
+            logs["cost_value_loss"].append(float(cost_value))
+            logs["entropy_loss"].append(entropy.item())
+            logs["clip_fraction"].append(clip_fraction(ratio, clip_range).item())
+            logs["approx_kl"].append(kl)
+            logs["loss"].append(loss.item())
+        return loss, kl
+
+    def _value_losses(
+        self, values: th.Tensor, cost_values: th.Tensor, batch: TeamSamples
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Loss of the reward critic, and the sum of those of the cost critics."""
+        clip = None
+        if self.clip_range_vf is not None:
+            clip = self.clip_range_vf(self._current_progress_remaining)
+        value = value_loss(values, batch.returns, batch.old_values, clip)
+        cost_value = th.zeros((), device=self.device)
+        pairs = zip(cost_values.unbind(-1), batch.cost_returns.unbind(-1), strict=True)
+        for (new, target), old in zip(pairs, batch.old_cost_values.unbind(-1), strict=True):
+            cost_value = cost_value + value_loss(new, target, old, clip)
+        return value, cost_value
+
+    def _gradient_step(self, loss: th.Tensor) -> None:
+        if not th.isfinite(loss):
+            raise ValueError(
+                f"the loss is {loss.item()} after {self.num_timesteps} agent steps; training "
+                "stops, the model keeps its last finite parameters. Lower learning_rate or "
+                "reward_scale, or use normalize_values=True"
+            )
+        self.policy.optimizer.zero_grad()
+        loss.backward()
+        # The cost critics are clipped on their own, so that watching a cost changes nothing else.
+        cost_parameters = self.policy.cost_parameters()
+        cost_ids = {id(p) for p in cost_parameters}
+        others = [p for p in self.policy.parameters() if id(p) not in cost_ids]
+        for parameters in (others, cost_parameters):
+            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.policy.optimizer.step()
+
+    def _update_multipliers(self) -> None:
+        """One dual step from the episodes that finished in this rollout; none without episodes."""
+        finished_costs = self._recorder.finished_costs
+        if finished_costs and len(self.cost_limits):
+            excess = violation(np.array(finished_costs), self._party_limits)
+            self.multipliers.update(th.as_tensor(excess, dtype=th.float32, device=self.device))
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        super()._update_learning_rate(optimizers)
+        if self.critic_lr_schedule is not None:
+            rate = self.critic_lr_schedule(self._current_progress_remaining)
+            self.policy.optimizer.param_groups[1]["lr"] = rate
+
+    # ------------------------------------------------------------------ logging, saving
+
+    def _log_training(self, logs: dict[str, list[float]]) -> None:
+        if not len(self.cost_limits):
+            del logs["cost_value_loss"]
+        logs["loss"] = logs["loss"][-1:]
+        for name, numbers in logs.items():
+            self.logger.record(f"train/{name}", float(np.mean(numbers)))
+        buffer = self.rollout_buffer
+        explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        self.logger.record("train/explained_variance", explained)
+        for name, number in self._numbered("lambda", self.multipliers.values.mean(dim=0).tolist()):
+            self.logger.record(f"train/{name}", number)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        progress = self._current_progress_remaining
+        self.logger.record("train/clip_range", self.clip_range(progress))
+        if self.clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", self.clip_range_vf(progress))
+
+    @staticmethod
+    def _numbered(name: str, numbers: Sequence[float]) -> list[tuple[str, float]]:
+        """Logger keys: the plain name for one constraint, name_0, name_1, ... for several."""
+        if len(numbers) == 1:
+            return [(name, numbers[0])]
+        return [(f"{name}_{j}", number) for j, number in enumerate(numbers)]
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write the log; adds the episode costs and the number of environment steps."""
+        assert self.ep_info_buffer is not None
+        if self.ep_info_buffer:
+            for key in [k for k in self.ep_info_buffer[0] if k.startswith("cost")]:
+                mean = safe_mean([info[key] for info in self.ep_info_buffer])
+                self.logger.record(f"rollout/ep_{key.replace('cost', 'cost_mean', 1)}", mean)
+        self.logger.record("time/env_steps", self.num_timesteps // self.n_agents)
+        super().dump_logs(iteration)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> "MAPPO":
+        """Train until that many agent steps are done; see ``PPO.learn``."""
+        name = tb_log_name or type(self).__name__
+        return super().learn(
+            total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar
+        )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer", "multipliers"], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_recorder"]
+
+    def save(
+        self,
+        path: str | pathlib.Path | Any,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save everything that learns to a zip file, so that a crash never leaves half a file.
+
+        :param path: Where to save; ".zip" is added if there is no suffix. Or an open file
+        :param exclude: Names of parameters to leave out besides the default ones
+        :param include: Names of parameters that the default would leave out
+        """
+        if not isinstance(path, (str, pathlib.Path)):
+            super().save(path, exclude, include)
+            return
+        target = pathlib.Path(path)
+        with atomic_write(target if target.suffix else target.with_suffix(".zip")) as file:
+            super().save(file, exclude, include)  # type: ignore[arg-type]
+
+
+class E2CMAPPO(MAPPO):
+    """E2C-MAPPO: MAPPO that explores by observation entropy (Alg. 1 and 2).
+
+    The same as ``MAPPO`` with an :class:`sb3_e2c.OEMRewardCallback` as the first callback of
+    every ``learn``, unless the caller passes one.
+
+    :param args: See :class:`MAPPO`
+    :param oem_kwargs: Arguments of the callback; default: the bonus of the 5th nearest neighbor
+        alone ("pure"), as the paper has it for the particle tasks
+    :param kwargs: See :class:`MAPPO`
+    """
+
+    def __init__(self, *args: Any, oem_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        self.oem_kwargs = oem_kwargs or {
+            "estimator": "nearest_neighbor",
+            "estimator_kwargs": {"k": 5},
+        }
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._oem_callback = OEMRewardCallback(**self.oem_kwargs)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        given = callback if isinstance(callback, (list, CallbackList)) else [callback]
+        callbacks = given.callbacks if isinstance(given, CallbackList) else given
+        if any(isinstance(each, OEMRewardCallback) for each in callbacks):
+            return super()._init_callback(callback, progress_bar)
+        rest = super()._init_callback(callback, progress_bar)
+        both = CallbackList([self._oem_callback, rest])
+        both.init_callback(self)
+        return both
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_oem_callback"]
+
+
+def _agents(env: VecEnv | None) -> list[str]:
+    """Names of a team's agents; a single-agent environment is a team of one."""
+    return list(getattr(env, "agents", ["agent"]))

@@ -1,0 +1,119 @@
+"""Lagrange multipliers: the price of violating a cost limit (Eqs. 6, 7; Alg. 2 l. 11).
+
+A multiplier object owns λ of shape (K, M), K being 1 for team constraints and N for individual
+ones, and changes it with one verb, ``update(violation)``.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch as th
+from torch import nn
+
+
+class Multipliers(nn.Module, ABC):
+    """What the algorithm needs to know; write your own by subclassing.
+
+    Whatever must survive saving and loading is a buffer of the module.
+    """
+
+    values: th.Tensor  # λ, shape (K, M)
+
+    def __init__(self, shape: tuple[int, int], **kwargs: Any):  # noqa: ARG002
+        super().__init__()
+
+    @abstractmethod
+    def update(self, violation: th.Tensor) -> None:
+        """Take one dual step.
+
+        :param violation: J − l, shape (K, M)
+        """
+
+
+class GradientMultipliers(Multipliers):
+    """Projected gradient ascent on the violation (Eq. 7).
+
+    λ ← min(λ_max, max(0, λ + η (J − l)))
+
+    :param shape: (K, M)
+    :param learning_rate: Step size η (Table 1: 0.05), in reward per squared unit of cost
+    :param initial: λ at the start (Alg. 2: 0; Table 1: 1)
+    :param maximum: λ_max; infinite as in the paper ("growing unbounded")
+    :param agent_scaling: Multiply the step by K. An individual violation is about N times smaller
+        than the team's, so that the multipliers of both kinds of constraints move alike; False
+        takes the paper's literal step (docs/paper.md, D8)
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        learning_rate: float = 0.05,
+        initial: float = 0.0,
+        maximum: float = math.inf,
+        agent_scaling: bool = True,
+    ):
+        super().__init__(shape)
+        _check(learning_rate=learning_rate, initial=initial, maximum=maximum)
+        self.learning_rate = learning_rate * (shape[0] if agent_scaling else 1)
+        self.maximum = maximum
+        self.register_buffer("values", th.full(shape, float(initial)))
+
+    def update(self, violation: th.Tensor) -> None:
+        """See :meth:`Multipliers.update`."""
+        self.values.add_(self.learning_rate * violation).clamp_(0.0, self.maximum)
+
+
+class PIDMultipliers(Multipliers):
+    """PID-controlled multipliers (Stooke, Achiam, Abbeel 2020, Algorithm 2).
+
+    Δ = J − l,  I ← max(0, I + k_i Δ),  λ = min(λ_max, max(0, k_p Δ + I + k_d max(0, J − J_prev)))
+
+    The proportional term damps the oscillation of the integral, the derivative term brakes a
+    rising cost early. With k_p = k_d = 0 this is :class:`GradientMultipliers` with η = k_i.
+
+    :param shape: (K, M)
+    :param kp: Gain of the violation
+    :param ki: Gain of its sum over the rollouts
+    :param kd: Gain of the increase of the cost since the last rollout
+    :param initial: I, and λ, at the start
+    :param maximum: λ_max, also the limit of the integral
+    :param agent_scaling: See :class:`GradientMultipliers`; scales all three gains
+    """
+
+    integral: th.Tensor
+    previous: th.Tensor
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        kp: float = 0.05,
+        ki: float = 0.01,
+        kd: float = 0.05,
+        initial: float = 0.0,
+        maximum: float = math.inf,
+        agent_scaling: bool = True,
+    ):
+        super().__init__(shape)
+        _check(kp=kp, ki=ki, kd=kd, initial=initial, maximum=maximum)
+        scale = shape[0] if agent_scaling else 1
+        self.kp, self.ki, self.kd = scale * kp, scale * ki, scale * kd
+        self.maximum = maximum
+        self.register_buffer("values", th.full(shape, float(initial)))
+        self.register_buffer("integral", self.values.clone())
+        self.register_buffer("previous", th.full(shape, math.inf))  # no increase at first
+
+    def update(self, violation: th.Tensor) -> None:
+        """See :meth:`Multipliers.update`."""
+        increase = (violation - self.previous).nan_to_num(0.0).clamp_(min=0.0)
+        self.previous.copy_(violation)
+        self.integral.add_(self.ki * violation).clamp_(0.0, self.maximum)
+        proportional = (self.kp * violation).nan_to_num(0.0)  # 0 * inf: an infinite limit
+        values = proportional + self.integral + self.kd * increase
+        self.values.copy_(values.clamp_(0.0, self.maximum))
+
+
+def _check(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not value >= 0:
+            raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")

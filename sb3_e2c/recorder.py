@@ -1,0 +1,138 @@
+"""From what worlds answer to what the learner stores: costs, time-outs, the critics' extra state.
+
+Shapes: W worlds, N agents, S = W·N slots, D observation size, G size of the critics' extra state,
+K constrained parties (1 or N), M constraints.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_e2c.buffers import TeamRolloutBuffer, Timeout
+from sb3_e2c.constraints import party_costs, read_costs
+
+Infos = Sequence[dict[str, Any]]
+
+
+class TeamRecorder:
+    """Follows the running episodes of all worlds and writes their steps to a rollout buffer.
+
+    :param agents: Names of the N agents
+    :param n_worlds: W
+    :param n_constraints: M
+    :param cost_scope: "team" or "individual"
+    :param team_cost: How the costs of agents make the team's, "sum" or "max"
+    :param critic_state_dim: G
+    """
+
+    def __init__(
+        self,
+        agents: Sequence[str],
+        n_worlds: int,
+        n_constraints: int,
+        cost_scope: str,
+        team_cost: str,
+        critic_state_dim: int,
+    ):
+        self.agents = list(agents)
+        self.n_worlds = n_worlds
+        self.n_constraints = n_constraints
+        self.cost_scope, self.team_cost = cost_scope, team_cost
+        self.critic_state_dim = critic_state_dim
+        self.finished_costs: list[np.ndarray] = []  # (K, M) for each episode of this rollout
+
+    @property
+    def n_agents(self) -> int:
+        """N."""
+        return len(self.agents)
+
+    def start(self, observations: np.ndarray, reset_infos: Infos) -> None:
+        """Begin anew after a reset of all worlds.
+
+        :param observations: Shape (S, D)
+        :param reset_infos: One dict for each slot
+        """
+        parties = 1 if self.cost_scope == "team" else self.n_agents
+        self.episode_costs = np.zeros((self.n_worlds, parties, self.n_constraints))
+        self.critic_states = self._critic_states(reset_infos)
+        self._check_finite(n_steps=0, observation=observations)
+
+    def record(
+        self,
+        buffer: TeamRolloutBuffer,
+        last_obs: np.ndarray,
+        episode_starts: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        new_obs: np.ndarray,
+        dones: np.ndarray,
+        infos: Infos,
+        reset_infos: Infos,
+    ) -> None:
+        """Store one step of all slots.
+
+        :param buffer: Where to
+        :param last_obs: Observations before the step, shape (S, D)
+        :param episode_starts: Whether they began an episode, shape (S,)
+        :param actions: Shape (S, A)
+        :param rewards: Shape (S,)
+        :param new_obs: Observations after the step, shape (S, D)
+        :param dones: Whether the step ended an episode, shape (S,)
+        :param infos: One dict for each slot
+        :param reset_infos: One dict for each slot, new where an episode ended
+        """
+        ended = dones[:: self.n_agents]
+        agent_costs = read_costs(infos, self.n_constraints, self.agents)
+        slot_costs = agent_costs.reshape(len(infos), self.n_constraints)
+        self._check_finite(buffer.pos, observation=new_obs, reward=rewards, cost=slot_costs)
+        costs = party_costs(agent_costs, self.cost_scope, self.team_cost)
+        critic_states = self._critic_states(infos)
+        timeout = self._timeout(buffer.pos, ended, infos, critic_states)
+        step = (last_obs, actions, rewards, episode_starts, costs, self.critic_states)
+        buffer.add(*step, ended, timeout)
+        self.episode_costs += costs
+        if ended.any():
+            self.finished_costs.extend(self.episode_costs[ended])
+            self.episode_costs[ended] = 0.0
+            critic_states[ended] = self._critic_states(reset_infos)[ended]
+        self.critic_states = critic_states
+
+    def _critic_states(self, infos: Infos) -> np.ndarray:
+        """Extra state of the critics, shape (W, G)."""
+        if not self.critic_state_dim:
+            return np.zeros((self.n_worlds, 0), np.float32)
+        return np.array([info["critic_state"] for info in infos[:: self.n_agents]], np.float32)
+
+    def _timeout(
+        self, step: int, ended: np.ndarray, infos: Infos, critic_states: np.ndarray
+    ) -> Timeout | None:
+        cut_off = [
+            world
+            for world in np.flatnonzero(ended).tolist()
+            if infos[world * self.n_agents].get("TimeLimit.truncated", False)
+        ]
+        if not cut_off:
+            return None
+        worlds = np.array(cut_off)
+        slots = (worlds[:, None] * self.n_agents + np.arange(self.n_agents)).ravel().tolist()
+        observations = np.array([infos[slot]["terminal_observation"] for slot in slots])
+        return Timeout(step, worlds, observations, critic_states[worlds])
+
+    def _check_finite(self, n_steps: int, **quantities: np.ndarray) -> None:
+        """Stop before a number that is not finite reaches the networks.
+
+        :param n_steps: Steps of this rollout so far
+        :param quantities: Arrays by name, shape (S, ...)
+        """
+        for name, array in quantities.items():
+            finite = np.isfinite(array)
+            if finite.all():
+                continue
+            first = int(np.argwhere(~finite)[0, 0])
+            world, agent = divmod(first, self.n_agents)
+            raise ValueError(
+                f"{name} of world {world}, agent {self.agents[agent]!r} is not finite at step "
+                f"{n_steps} of the rollout: {array[first]}. Training stops, the model keeps its "
+                "last parameters; mend the environment, or bound this quantity"
+            )

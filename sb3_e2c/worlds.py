@@ -1,0 +1,527 @@
+"""The worlds behind a :class:`~sb3_e2c.vec_env.MultiAgentVecEnv`, in one of two ways.
+
+    ParallelEnv ─► World ─► SuperSuit's rows ─► SuperSuitWorlds, WorkerWorlds ─┐
+    ParallelEnv.batched(W) ───────────────────► BatchedWorlds ─────────────────┴─► Step
+
+Both give the same trajectories for the same seeds. W worlds of N agents are S = W·N slots,
+slot = world·N + agent; a world begins its next episode within the step that ends the last one.
+"""
+
+import atexit
+import multiprocessing
+import multiprocessing.connection
+import time
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+import supersuit as ss
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from supersuit.vector import MakeCPUAsyncConstructor
+from supersuit.vector.multiproc_vec import decompress_info
+from typing_extensions import override
+
+MakeEnv = Callable[[], ParallelEnv]
+Infos = list[dict[str, Any]]
+
+# SuperSuit lays the infos of a reset over those of the step before it; under a key of their own
+# both arrive.
+_RESET_INFO = "_reset_info"
+# Patience with worlds that are being closed; then their workers are killed.
+_CLOSE_SECONDS = 5.0
+
+
+class BatchedSimulator(Protocol):
+    """What ``ParallelEnv.batched(n_worlds)`` returns: W worlds in one set of arrays.
+
+    Every world has a random stream of its own, which a seed restarts and None continues.
+    """
+
+    n_worlds: int
+    possible_agents: list[str]
+    render_mode: str | None
+    metadata: dict[str, Any]
+
+    def observation_space(self, agent: str) -> spaces.Space:
+        """Observation space of an agent, the same for all."""
+
+    def action_space(self, agent: str) -> spaces.Space:
+        """Action space of an agent, the same for all."""
+
+    def reset(
+        self,
+        worlds: np.ndarray,
+        seeds: Sequence[int | None],
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Start an episode in R worlds: observations (R, N, D), infos as arrays (R, N, ...)."""
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Step all worlds without any reset; all that is returned is fresh.
+
+        :param actions: shape (W, N, ...)
+        :return: observations (W, N, D), rewards (W, N), terminated (W,), truncated (W,), infos as
+            arrays (W, N, ...)
+        """
+
+    def render(self, world: int) -> np.ndarray:
+        """Picture of one world, uint8 (height, width, 3)."""
+
+    def close(self) -> None:
+        """Release what the simulator holds."""
+
+
+class Step(NamedTuple):
+    """One step of all worlds; ``reset_infos`` has the slots that began a new episode."""
+
+    observations: Any  # (S, ...)
+    rewards: np.ndarray  # (S,) float32
+    terminated: np.ndarray  # (S,) bool
+    truncated: np.ndarray  # (S,) bool
+    infos: Infos  # S own dicts
+    reset_infos: dict[int, dict[str, Any]]
+
+
+class Worlds(ABC):
+    """W worlds that are stepped together and begin a new episode by themselves.
+
+    :param n_worlds: W
+    :param like: a world or simulator with the agents and spaces of all
+    """
+
+    failed = False
+
+    def __init__(self, n_worlds: int, like: Any):
+        self.n_worlds = n_worlds
+        self.agents = list(like.possible_agents)
+        self.observation_space = _as_float32(like.observation_space(self.agents[0]))
+        self.action_space = like.action_space(self.agents[0])
+        self.render_mode: str | None = like.render_mode
+        self.metadata: dict[str, Any] = like.metadata
+
+    @abstractmethod
+    def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[Any, Infos]:
+        """Reset all worlds, given one seed and one dict of options for each of them."""
+
+    @abstractmethod
+    def step_async(self, actions: np.ndarray) -> None:
+        """Begin a step, actions (S, ...)."""
+
+    @abstractmethod
+    def step_wait(self) -> Step:
+        """Finish the step."""
+
+    @abstractmethod
+    def images(self) -> list[Any]:
+        """Render every world, W results."""
+
+    @abstractmethod
+    def owner(self, world: int) -> Any:
+        """Object that holds the attributes of a world."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release all worlds."""
+
+
+class BatchedWorlds(Worlds):
+    """All worlds in one simulator; picklable with their whole state if the simulator is."""
+
+    def __init__(self, sim: BatchedSimulator):
+        super().__init__(sim.n_worlds, sim)
+        self.sim = sim
+
+    @override
+    def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[np.ndarray, Infos]:
+        worlds = np.arange(self.n_worlds)
+        if all(option is options[0] for option in options) or not any(options):
+            observations, columns = self.sim.reset(worlds, seeds, options[0] or None)
+            return _flat(observations), _rows(columns, observations.shape[:2])
+        parts = [
+            self.sim.reset(worlds[[w]], [seeds[w]], options[w] or None) for w in range(len(worlds))
+        ]
+        infos = [row for obs, columns in parts for row in _rows(columns, obs.shape[:2])]
+        return _flat(np.concatenate([observations for observations, _ in parts])), infos
+
+    @override
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions.reshape(self.n_worlds, len(self.agents), *actions.shape[1:])
+
+    @override
+    def step_wait(self) -> Step:
+        observations, rewards, terminated, truncated, columns = self.sim.step(self._actions)
+        shape = (self.n_worlds, len(self.agents))
+        assert observations.shape[:2] == rewards.shape == shape, "sim.step returns (W, N, ...)"
+        infos = _rows(columns, shape)
+        ended = np.flatnonzero(terminated | truncated)
+        reset_infos = self._begin(ended, observations, infos) if len(ended) else {}
+        return Step(
+            _flat(observations),
+            np.array(rewards, dtype=np.float32).reshape(-1),
+            np.repeat(terminated, shape[1]),
+            np.repeat(truncated, shape[1]),
+            infos,
+            reset_infos,
+        )
+
+    def _begin(
+        self, ended: np.ndarray, observations: np.ndarray, infos: Infos
+    ) -> dict[int, dict[str, Any]]:
+        """Begin the next episode of some worlds; edits observations and infos in place."""
+        n_agents = len(self.agents)
+        slots = [world * n_agents + agent for world in ended.tolist() for agent in range(n_agents)]
+        for slot, last in zip(slots, _flat(observations[ended]), strict=True):
+            infos[slot]["terminal_observation"] = last
+        observations[ended], columns = self.sim.reset(ended, [None] * len(ended), None)
+        return dict(zip(slots, _rows(columns, (len(ended), n_agents)), strict=True))
+
+    @override
+    def images(self) -> list[Any]:
+        return [self.sim.render(world) for world in range(self.n_worlds)]
+
+    @override
+    def owner(self, world: int) -> Any:
+        return self.sim
+
+    @override
+    def close(self) -> None:
+        self.sim.close()
+
+
+class SuperSuitWorlds(Worlds):
+    """One PettingZoo environment for each world, flattened by SuperSuit in this process."""
+
+    def __init__(self, envs: list[ParallelEnv]):
+        _check_distinct(envs)
+        super().__init__(len(envs), World(envs[0], 0))
+        self.envs = envs
+        self.vec = self._build([partial(_rows_of, env, w) for w, env in enumerate(envs)], 1)
+
+    def _build(self, makers: Sequence[Callable[[], Any]], n_processes: int) -> Any:
+        constructor = MakeCPUAsyncConstructor(n_processes)
+        return constructor(makers, self.observation_space, self.action_space)
+
+    @override
+    def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[Any, Infos]:
+        observations, infos = self.vec.reset(options={"seeds": list(seeds), "options": options})
+        return observations, [info[_RESET_INFO] for info in infos]
+
+    @override
+    def step_async(self, actions: np.ndarray) -> None:
+        self.vec.step_async(actions)
+
+    @override
+    def step_wait(self) -> Step:
+        observations, rewards, terminated, truncated, infos = self.vec.step_wait()
+        # Empty infos of worker processes are all one and the same dict.
+        infos = [dict(info) for info in infos]
+        reset_infos = {
+            slot: info.pop(_RESET_INFO) for slot, info in enumerate(infos) if _RESET_INFO in info
+        }
+        return Step(
+            observations,
+            rewards,
+            terminated.astype(bool),
+            truncated.astype(bool),
+            infos,
+            reset_infos,
+        )
+
+    @override
+    def images(self) -> list[Any]:
+        return [env.render() for env in self.envs]
+
+    @override
+    def owner(self, world: int) -> Any:
+        return self.envs[world].unwrapped
+
+    @override
+    def close(self) -> None:
+        self.vec.close()
+
+
+class WorkerWorlds(SuperSuitWorlds):
+    """SuperSuit's worlds divided among worker processes.
+
+    :param make_env: makes the worlds inside the workers
+    :param examples: environments of this process, only looked at
+    :param n_worlds: W
+    :param n_processes: number of workers
+    """
+
+    def __init__(
+        self, make_env: MakeEnv, examples: list[ParallelEnv], n_worlds: int, n_processes: int
+    ):
+        _check_distinct(examples)
+        Worlds.__init__(self, n_worlds, World(examples[0], 0))
+        for env in examples:
+            env.close()
+        makers = [partial(_make_rows, make_env, world) for world in range(n_worlds)]
+        others = set(multiprocessing.active_children())
+        try:
+            self.vec = self._build(makers, n_processes)
+        except BaseException:
+            _kill([p for p in multiprocessing.active_children() if p not in others])
+            raise
+        # Workers still alive at the interpreter's exit would be waited for, without end.
+        atexit.register(_close_if_alive, weakref.ref(self))
+
+    @override
+    def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[Any, Infos]:
+        with self._answering():
+            payload = {"seeds": list(seeds), "options": options}
+            observations, packed = self.vec.reset(options=payload)
+        infos = decompress_info(self.vec.num_envs, self.vec.idx_starts, packed)
+        return observations, [info[_RESET_INFO] for info in infos]
+
+    @override
+    def step_async(self, actions: np.ndarray) -> None:
+        with self._answering():
+            super().step_async(actions)
+
+    @override
+    def step_wait(self) -> Step:
+        with self._answering():
+            return super().step_wait()
+
+    @contextmanager
+    def _answering(self) -> Iterator[None]:
+        """Turn a broken pipe into the news that a worker died; stop all workers on any error."""
+        try:
+            yield
+        except BaseException as error:
+            self.failed = True
+            dead = self._dead_workers() if isinstance(error, (EOFError, OSError)) else ""
+            _kill(self.vec.procs)
+            self.vec.close()
+            if dead:
+                raise RuntimeError(
+                    f"{dead}; expected it to answer with its worlds' next observations. Look above "
+                    "for its traceback and for lack of memory, try n_processes=1, and make the "
+                    "environment again"
+                ) from error
+            raise
+
+    def _dead_workers(self) -> str:
+        """Name a worker that did not end by itself; a world's own exception ends it with code 0."""
+        procs = self.vec.procs
+        ended = multiprocessing.connection.wait([proc.sentinel for proc in procs], timeout=1.0)
+        for number, proc in enumerate(procs):
+            if proc.sentinel in ended:
+                proc.join(timeout=1.0)  # its pipes close a moment before it has an exit code
+            if proc.exitcode:
+                first, end = (i // len(self.agents) for i in self.vec.idx_starts[number:][:2])
+                return (
+                    f"worker process {number} (worlds {first} to {end - 1}) ended with exit code "
+                    f"{proc.exitcode}"
+                )
+        return ""
+
+    @override
+    def images(self) -> list[Any]:
+        return [self.owner(0)]
+
+    @override
+    def owner(self, world: int) -> Any:
+        raise AttributeError(
+            f"world {world} lives in one of {len(self.vec.procs)} worker processes, where its "
+            "attributes, methods and pictures are out of reach; use n_processes=1 for them"
+        )
+
+    @override
+    def close(self) -> None:
+        # SuperSuit's close() ends the workers by an error inside them, without closing the worlds.
+        for pipe in self.vec.pipes:
+            with suppress(OSError):
+                pipe.send("close")
+                pipe.send("terminate")
+        deadline = time.monotonic() + _CLOSE_SECONDS
+        for proc in self.vec.procs:
+            proc.join(timeout=max(0.0, deadline - time.monotonic()))
+        _kill(self.vec.procs)
+        self.vec.close()
+
+
+class World(BaseParallelWrapper):
+    """A world as SuperSuit needs it: agents in one order, own infos, its own seed and options.
+
+    :param env: environment whose agents all end in the same step
+    :param index: number of the world
+    """
+
+    def __init__(self, env: ParallelEnv, index: int):
+        super().__init__(env)
+        self.index = index
+        self.possible_agents = list(env.possible_agents)
+        self.agents = list(env.possible_agents)  # SuperSuit resets before it looks again
+        self.metadata = getattr(env, "metadata", {})
+        # Multi-agent MuJoCo keeps the mode in the robot's environment only.
+        robot = getattr(env.unwrapped, "single_agent_env", None)
+        self.render_mode = getattr(env, "render_mode", None) or getattr(robot, "render_mode", None)
+        self._space = _as_float32(env.observation_space(self.agents[0]))
+
+    @property
+    @override
+    def unwrapped(self) -> ParallelEnv:
+        # SuperSuit reads unwrapped.render_mode, which not every environment has.
+        return self
+
+    @override
+    def observation_space(self, agent: str) -> spaces.Space:
+        return self._space
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Reset, with what is meant for this world if the reset is not an automatic one."""
+        if options is not None:
+            seed, own = options["seeds"][self.index], options["options"][self.index]
+            options = own or None
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._check_agents("reset", observations)
+        own_infos = {a: {_RESET_INFO: dict(infos.get(a, {}))} for a in self.agents}
+        return self._observations(observations), own_infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """Step, and refuse what does not fit one row for each agent."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        self._check_agents("step", observations, rewards, terminated, truncated)
+        self._check_end(terminated, truncated)
+        return (
+            self._observations(observations),
+            {agent: rewards[agent] for agent in self.agents},
+            {agent: bool(terminated[agent]) for agent in self.agents},
+            {agent: bool(truncated[agent]) for agent in self.agents},
+            {agent: self._own_info(infos, agent) for agent in self.agents},
+        )
+
+    def _observations(self, observations: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(self._space, spaces.Box):
+            return {agent: observations[agent] for agent in self.agents}
+        dtype = self._space.dtype
+        return {agent: np.array(observations[agent], dtype=dtype) for agent in self.agents}
+
+    def _own_info(self, infos: dict[str, Any], agent: str) -> dict[str, Any]:
+        info = dict(infos.get(agent, {}))
+        info.pop("TimeLimit.truncated", None)  # patched wrappers set it; the VecEnv decides it
+        return info
+
+    def _check_agents(self, call: str, *answers: dict[str, Any]) -> None:
+        missing = sorted({a for answer in answers for a in self.agents if a not in answer})
+        if missing:
+            raise ValueError(
+                f"{call}() of world {self.index} returned nothing for the agents {missing}; "
+                f"expected all of {self.agents}, because each has a slot of its own until all end "
+                "together. Keep ended agents in the environment (zero reward, any observation)"
+            )
+
+    def _check_end(self, terminated: dict[str, Any], truncated: dict[str, Any]) -> None:
+        ended = [agent for agent in self.agents if terminated[agent] or truncated[agent]]
+        if 0 < len(ended) < len(self.agents):
+            others = [agent for agent in self.agents if agent not in ended]
+            raise ValueError(
+                f"the agents {ended} of world {self.index} ended while {others} go on; expected "
+                "all agents of a world to end in the same step. Keep ended agents in the "
+                "environment (zero reward, any observation), or end the episode for all"
+            )
+
+
+def _rows_of(env: ParallelEnv, world: int) -> Any:
+    return ss.pettingzoo_env_to_vec_env_v1(World(env, world))
+
+
+def _make_rows(make_env: MakeEnv, world: int) -> Any:
+    return _rows_of(new_env(make_env), world)
+
+
+def _flat(array: np.ndarray) -> np.ndarray:
+    """Worlds and agents as slots: (W, N, ...) becomes (S, ...)."""
+    return array.reshape(-1, *array.shape[2:])
+
+
+def _rows(columns: dict[str, np.ndarray], shape: tuple[int, ...]) -> Infos:
+    """Infos of every slot, from arrays (W, N, ...): Python numbers and rows of arrays."""
+    flat = [_flat(column) for column in columns.values()]
+    lists = [column.tolist() if column.ndim == 1 else list(column) for column in flat]
+    if not lists:
+        return [{} for _ in range(int(np.prod(shape)))]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
+
+
+def _as_float32(space: spaces.Space) -> spaces.Space:
+    """The same space in float32 if it is a box of float64, which SB3's buffers would keep."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.float64:
+        return space
+    with np.errstate(over="ignore"):  # the largest float64 becomes infinity, no bound at all
+        return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32))
+
+
+def _kill(procs: list[Any]) -> None:
+    for proc in procs:
+        if proc.is_alive():
+            proc.kill()
+        proc.join()
+
+
+def _close_if_alive(reference: "weakref.ref[WorkerWorlds]") -> None:
+    worlds = reference()
+    if worlds is not None:
+        worlds.close()
+
+
+def new_env(make_env: MakeEnv) -> Any:
+    """Make an environment and check that its agents can share one policy.
+
+    :param make_env: given by the user
+    :return: a ``ParallelEnv`` whose agents have equal spaces
+    """
+    env = make_env()
+    hint = ""
+    if isinstance(env, AECEnv):
+        hint = "; convert it with pettingzoo.utils.conversions.aec_to_parallel(env)"
+    elif isinstance(env, gym.Env):
+        hint = "; a gymnasium environment has one agent, use SB3's make_vec_env for it"
+    if not isinstance(env, ParallelEnv):
+        raise TypeError(
+            f"make_env returned an object of type {type(env).__name__}; expected a PettingZoo "
+            f"ParallelEnv{hint}"
+        )
+    if not getattr(env, "possible_agents", None):
+        raise ValueError(
+            f"{type(env).__name__} has no possible_agents; expected a list of all agents that ever "
+            "act, in a fixed order"
+        )
+    _check_spaces(env, env.observation_space, "observation", "pad_observations_v0")
+    _check_spaces(env, env.action_space, "action", "pad_action_space_v0")
+    return env
+
+
+def _check_spaces(
+    env: ParallelEnv, space: Callable[[str], spaces.Space], kind: str, padding: str
+) -> None:
+    first = env.possible_agents[0]
+    for agent in env.possible_agents[1:]:
+        if space(agent) != space(first):
+            raise ValueError(
+                f"the agents {first!r} and {agent!r} have different {kind} spaces, {space(first)} "
+                f"and {space(agent)}; expected equal ones, because all agents share one policy. "
+                f"Pad them, for example with supersuit.{padding}"
+            )
+
+
+def _check_distinct(envs: list[ParallelEnv]) -> None:
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise ValueError(
+            "make_env returned the same environment twice; expected a new one at every call, "
+            "because worlds are independent. Make it inside the function: "
+            "share_parameters(lambda: MyEnv(...)), not share_parameters(lambda: env)"
+        )
