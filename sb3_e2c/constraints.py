@@ -92,32 +92,51 @@ def violation(episode_costs: np.ndarray, limits: np.ndarray) -> np.ndarray:
     return episode_costs.mean(axis=0) - limits
 
 
-def read_costs(infos: Sequence[dict[str, Any]], n_costs: int, agents: Sequence[str]) -> np.ndarray:
-    """Costs that the environment reports in ``info["cost"]``.
+def read_costs(infos: Sequence[dict[str, Any]], agents: Sequence[str]) -> np.ndarray:
+    """Costs that the environment reports in ``info["cost"]``, as many as it reports.
 
     :param infos: One dict for each slot
-    :param n_costs: M, the number of constraints
-    :param agents: Names of the N agents, for the error message
-    :return: Shape (W, N, M), float64
-    :raises ValueError: if a slot reports no cost, or another number of costs
+    :param agents: Names of the N agents
+    :return: Shape (W, N, M), float64; M = 0 where no agent reports any
+    :raises ValueError: if agents report different numbers of costs
     """
-    if n_costs == 0:
+    found = [info["cost"] for info in infos if "cost" in info]
+    if not found:
         return np.zeros((len(infos) // len(agents), len(agents), 0))
     try:
-        costs = np.array([info["cost"] for info in infos], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
-        costs = np.empty(0)
-    if costs.size != len(infos) * n_costs:
-        raise _bad_cost(infos, n_costs, agents)
-    return costs.reshape(-1, len(agents), n_costs)
-
-
-def _bad_cost(infos: Sequence[dict[str, Any]], n_costs: int, agents: Sequence[str]) -> ValueError:
-    slot = next(s for s, i in enumerate(infos) if np.size(i.get("cost", ())) != n_costs)
-    world, agent = divmod(slot, len(agents))
-    found = repr(infos[slot]["cost"]) if "cost" in infos[slot] else "nothing"
-    return ValueError(
-        f"agent {agents[agent]!r} of world {world} reports {found} in info['cost'], but there are "
-        f"{n_costs} cost limits; expected a number, or a list of {n_costs} numbers, in the info "
-        "of every agent at every step. Report the cost there, or train without cost_limits"
+        if len(found) == len(infos):
+            return np.array(found, dtype=np.float64).reshape(-1, len(agents), np.size(found[0]))
+    except (TypeError, ValueError):
+        pass  # of different lengths, or no numbers
+    odd = next((s for s, info in enumerate(infos) if _n_costs(info) != _n_costs(infos[0])), 0)
+    world = odd // len(agents)
+    team = zip(agents, infos[world * len(agents) :], strict=False)
+    reports = {agent: info.get("cost", "nothing") for agent, info in team}
+    raise ValueError(
+        f"the agents report different costs in info['cost'], those of world {world}: {reports}; "
+        "expected a number, or equally many numbers, from every agent at every step, zeros "
+        "included, or nothing from all"
     )
+
+
+def _n_costs(info: dict[str, Any]) -> int:
+    try:
+        return np.asarray(info["cost"], dtype=np.float64).size
+    except (KeyError, TypeError, ValueError):
+        return -1
+
+
+def check_n_costs(agent_costs: np.ndarray, n_constraints: int, agents: Sequence[str]) -> None:
+    """Refuse limits that do not fit the costs.
+
+    :param agent_costs: Shape (W, N, M)
+    :param n_constraints: Number of limits
+    :param agents: Names of the N agents
+    :raises ValueError: unless M is the number of limits
+    """
+    if agent_costs.shape[-1] != n_constraints:
+        raise ValueError(
+            f"there are {n_constraints} cost limits, but agent {agents[0]!r} of world 0 reports "
+            f"{agent_costs.shape[-1]} costs in info['cost']; expected one for each limit, from "
+            "every agent at every step. Report it there, or change cost_limits (None: no limit)"
+        )

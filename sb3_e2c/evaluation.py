@@ -15,13 +15,12 @@ from stable_baselines3.common.vec_env import (
     sync_envs_normalization,
 )
 
-from sb3_e2c.constraints import parse_cost_limits, team_costs
+from sb3_e2c.constraints import parse_cost_limits, read_costs, team_costs
 from sb3_e2c.monitor import (
     TeamMonitor,
     add_costs,
     named_costs,
     raw_rewards,
-    read_step_costs,
     team_rewards,
     unwrap_team,
 )
@@ -155,7 +154,7 @@ class _Tally:
         :param infos: one for each slot
         """
         rewards = raw_rewards(self.env, rewards)
-        costs = read_step_costs(infos, self.team.agents)
+        costs = read_costs(infos, self.team.agents)
         self._returns += team_rewards(rewards, self.team)
         self._agent_returns += rewards.reshape(self._agent_returns.shape)
         self._costs = add_costs(self._costs, team_costs(costs, self.team.team_cost))

@@ -455,9 +455,9 @@ class MAPPO(PPO):
         """Write the log; adds the episode costs and the number of environment steps."""
         assert self.ep_info_buffer is not None
         if self.ep_info_buffer:
-            for key in [k for k in self.ep_info_buffer[0] if k.startswith("cost")]:
+            for key in [key for key in self.ep_info_buffer[0] if key.startswith("cost")]:
                 mean = safe_mean([info[key] for info in self.ep_info_buffer])
-                self.logger.record(f"rollout/ep_{key.replace('cost', 'cost_mean', 1)}", mean)
+                self.logger.record(f"rollout/ep_{key}_mean", mean)
         self.logger.record("time/env_steps", self.num_timesteps // self.n_agents)
         super().dump_logs(iteration)
 

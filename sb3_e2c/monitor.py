@@ -1,7 +1,6 @@
 """Statistics of whole teams: one record for each world's episode, not one for each agent's."""
 
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_e2c.constraints import team_costs
+from sb3_e2c.constraints import read_costs, team_costs
 from sb3_e2c.vec_env import MultiAgentVecEnv
 
 
@@ -46,7 +45,7 @@ class TeamMonitor(VecMonitor):
     def step_wait(self) -> VecEnvStepReturn:
         """Finish the step and add the records of the episodes that ended with it."""
         observations, rewards, dones, infos = self.venv.step_wait()
-        costs = team_costs(read_step_costs(infos, self._team.agents), self._team.team_cost)
+        costs = team_costs(read_costs(infos, self._team.agents), self._team.team_cost)
         self.episode_returns += team_rewards(raw_rewards(self.venv, rewards), self._team)
         self.episode_lengths += 1
         self.episode_costs = add_costs(self.episode_costs, costs)
@@ -126,29 +125,6 @@ def team_rewards(rewards: np.ndarray, team: MultiAgentVecEnv) -> np.ndarray:
     """
     by_agent = rewards.reshape(team.n_worlds, team.n_agents).astype(np.float64)
     return by_agent[:, 0] if team.team_return == "shared" else by_agent.sum(axis=1)
-
-
-def read_step_costs(infos: Sequence[dict[str, Any]], agents: Sequence[str]) -> np.ndarray:
-    """Costs of a step, as many as the environment reports.
-
-    :param infos: one for each slot
-    :param agents: names of the N agents
-    :return: shape (W, N, M), M = 0 where no agent reports any
-    :raises ValueError: if agents report different numbers of costs
-    """
-    found = [info["cost"] for info in infos if "cost" in info]
-    if not found:
-        return np.zeros((len(infos) // len(agents), len(agents), 0))
-    try:
-        if len(found) == len(infos):
-            return np.array(found, dtype=np.float64).reshape(-1, len(agents), np.size(found[0]))
-    except (TypeError, ValueError):
-        pass  # of different lengths, or no numbers
-    reports = {name: info.get("cost", "nothing") for name, info in zip(agents, infos, strict=False)}
-    raise ValueError(
-        f"the agents report different costs in info['cost'], those of world 0: {reports}; expected "
-        "a number, or equally many numbers, from every agent at every step, or nothing from all"
-    )
 
 
 def add_costs(sums: np.ndarray | None, costs: np.ndarray) -> np.ndarray:

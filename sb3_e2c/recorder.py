@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_e2c.buffers import TeamRolloutBuffer, Timeout
-from sb3_e2c.constraints import party_costs, read_costs
+from sb3_e2c.constraints import check_n_costs, party_costs, read_costs
 
 Infos = Sequence[dict[str, Any]]
 
@@ -83,7 +83,7 @@ class TeamRecorder:
         :param reset_infos: One dict for each slot, new where an episode ended
         """
         ended = dones[:: self.n_agents]
-        agent_costs = read_costs(infos, self.n_constraints, self.agents)
+        agent_costs = self._agent_costs(infos)
         slot_costs = agent_costs.reshape(len(infos), self.n_constraints)
         self._check_finite(buffer.pos, observation=new_obs, reward=rewards, cost=slot_costs)
         costs = party_costs(agent_costs, self.cost_scope, self.team_cost)
@@ -97,6 +97,14 @@ class TeamRecorder:
             self.episode_costs[ended] = 0.0
             critic_states[ended] = self._critic_states(reset_infos)[ended]
         self.critic_states = critic_states
+
+    def _agent_costs(self, infos: Infos) -> np.ndarray:
+        """Constrained costs of every agent, shape (W, N, M)."""
+        if not self.n_constraints:
+            return np.zeros((self.n_worlds, self.n_agents, 0))
+        costs = read_costs(infos, self.agents)
+        check_n_costs(costs, self.n_constraints, self.agents)
+        return costs
 
     def _critic_states(self, infos: Infos) -> np.ndarray:
         """Extra state of the critics, shape (W, G)."""

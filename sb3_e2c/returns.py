@@ -14,7 +14,7 @@ def gae(
     gamma: float,
     gae_lambda: float,
 ) -> np.ndarray:
-    """Generalized advantage estimate of a signal (Schulman et al. 2016, Eq. 16; the paper's Eq. 5).
+    """Generalized advantage estimate of a signal (Schulman et al. 2016, and the paper's Eq. 5).
 
     δₜ = rₜ + γ (1 − dₜ) Vₜ₊₁ − Vₜ,   Aₜ = δₜ + γλ (1 − dₜ) Aₜ₊₁
 

@@ -5,8 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
+
+# Tests run side by side; threads that wait for each other would only slow them down.
+th.set_num_threads(1)
 
 SLOW, FAST = 0, 1
 AGENTS = ["agent_0", "agent_1"]
@@ -30,8 +34,10 @@ class TwoOnALine(ParallelEnv):
     2 · (4 + 10) = 28 at cost 8 without limit, and 8 at cost 0 for all slow. A multiplier between
     2 and 3 makes it optimal.
 
-    :param length: steps of an episode; ``reset(options={"length": ...})`` changes it
-    :param end: "truncated" or "terminated", how an episode ends
+    ``reset(options=...)`` knows ``"length"``, kept from then on, and ``"start"``, for one episode.
+
+    :param length: steps of an episode
+    :param end: "truncated", "terminated" or "both", how an episode ends
     :param agent_costs: cost of a fast step of each agent
     :param n_costs: M; cost j is (j + 1) times the first, and 0 means that none is reported
     :param shared: whether both get the sum of what they earn
@@ -86,8 +92,9 @@ class TwoOnALine(ParallelEnv):
     ) -> tuple[dict, dict]:
         if seed is not None:
             self.rng = np.random.default_rng(seed)
-        self.length = (options or {}).get("length", self.length)
-        self.start = int(self.rng.integers(self.spread))
+        options = options or {}
+        self.length = options.get("length", self.length)
+        self.start = options.get("start", int(self.rng.integers(self.spread)))
         self.positions = [float(self.start), self.start + 1.0]
         self.t = 0
         self.agents = self.possible_agents[:]
@@ -109,8 +116,8 @@ class TwoOnALine(ParallelEnv):
         return (
             self._observations(),
             dict(zip(AGENTS, earned, strict=True)),
-            dict.fromkeys(AGENTS, over and self.end == "terminated"),
-            dict.fromkeys(AGENTS, over and self.end == "truncated"),
+            dict.fromkeys(AGENTS, over and self.end != "truncated"),
+            dict.fromkeys(AGENTS, over and self.end != "terminated"),
             {agent: self._info(cost) for agent, cost in zip(AGENTS, costs, strict=True)},
         )
 
@@ -167,8 +174,8 @@ class TwoOnManyLines:
             if seed is not None:
                 self.rngs[world] = np.random.default_rng(seed)
             self.start[world] = self.rngs[world].integers(self.one.spread)
-        if options and "length" in options:
-            self.length[worlds] = options["length"]
+        for name in {"length", "start"} & set(options or {}):
+            getattr(self, name)[worlds] = options[name]
         self.positions[worlds] = self.start[worlds, None] + np.arange(2)
         self.t[worlds] = 0
         start = np.repeat(self.start[worlds, None], 2, axis=1)
@@ -183,8 +190,8 @@ class TwoOnManyLines:
             rewards = np.repeat(rewards.sum(axis=1, keepdims=True), 2, axis=1)
         self.t += 1
         over = self.t == self.length
-        no = np.zeros_like(over)
-        terminated, truncated = (no, over) if self.one.end == "truncated" else (over, no)
+        terminated = over & (self.one.end != "truncated")
+        truncated = over & (self.one.end != "terminated")
         infos = self._costs(actions) | self._critic_state(np.arange(self.n_worlds))
         return self._observations(), rewards.astype(np.float32), terminated, truncated, infos
 

@@ -45,19 +45,24 @@ def test_violation_is_the_mean_episode_cost_minus_the_limit():
 
 def test_costs_are_read_by_world_and_agent():
     infos = [{"cost": c} for c in (0, 1.0, 2, np.float32(3))]
-    assert constraints.read_costs(infos, 1, AGENTS).tolist() == [[[0], [1]], [[2], [3]]]
+    assert constraints.read_costs(infos, AGENTS).tolist() == [[[0], [1]], [[2], [3]]]
     infos = [{"cost": (0.0, 1.0)}, {"cost": np.array([2.0, 3.0])}]
-    assert constraints.read_costs(infos, 2, AGENTS).tolist() == [[[0, 1], [2, 3]]]
+    assert constraints.read_costs(infos, AGENTS).tolist() == [[[0, 1], [2, 3]]]
+    assert constraints.read_costs([{}] * 4, AGENTS).shape == (2, 2, 0)
 
 
 @pytest.mark.parametrize(
-    ("infos", "message"),
-    [
-        ([{"cost": 0.0}, {}], r"agent 'a_1' of world 0 reports nothing in info\['cost'\]"),
-        ([{"cost": 0.0}, {"cost": [0, 1]}], r"agent 'a_1' of world 0 reports \[0, 1\]"),
-        ([{"cost": [0, 1]}, {"cost": [0, 1]}], "there are 1 cost limits"),
-    ],
+    ("second", "report"),
+    [({}, "'nothing'"), ({"cost": [0, 1]}, r"\[0, 1\]"), ({"cost": "x"}, "'x'")],
 )
-def test_a_missing_cost_names_the_agent_and_the_convention(infos, message):
-    with pytest.raises(ValueError, match=message):
-        constraints.read_costs(infos, 1, AGENTS)
+def test_agents_that_report_different_costs_are_named(second, report):
+    with pytest.raises(ValueError, match=f"those of world 1: {{'a_0': 0.0, 'a_1': {report}}}"):
+        constraints.read_costs([{"cost": 0.0}] * 3 + [second], AGENTS)
+
+
+def test_limits_must_fit_the_costs():
+    constraints.check_n_costs(np.zeros((1, 2, 3)), 3, AGENTS)
+    with pytest.raises(
+        ValueError, match=r"there are 2 cost limits, but agent 'a_0' of world 0 rep"
+    ):
+        constraints.check_n_costs(np.zeros((1, 2, 3)), 2, AGENTS)

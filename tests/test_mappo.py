@@ -234,11 +234,13 @@ class TestConstraints:
         assert model.multipliers.values.item() == pytest.approx(32.0)
 
     def test_limits_need_an_environment_with_costs(self):
-        with pytest.raises(ValueError, match="agent 'agent_0' of world 0 reports nothing in info"):
+        with pytest.raises(ValueError, match="agent 'agent_0' of world 0 reports 0 costs in info"):
             make(env=line(n_costs=0), cost_limits=1.0).learn(32)
 
     def test_the_number_of_limits_must_be_the_number_of_costs(self):
-        with pytest.raises(ValueError, match=r"reports array.*but there are 1 cost limits"):
+        with pytest.raises(
+            ValueError, match=r"there are 1 cost limits, but agent .* reports 2 costs"
+        ):
             make(env=line(n_costs=2), cost_limits=1.0).learn(32)
 
     def test_costs_without_limits_are_only_watched(self):
@@ -252,7 +254,7 @@ class TestConstraints:
         make(env=line(n_costs=2), cost_limits=[1.0, 2.0]).learn(64, callback=recorded)
         for key in ("train/lambda_0", "train/lambda_1", "train/cost_value_loss"):
             assert key in recorded.values
-        means = [recorded.values[f"rollout/ep_cost_mean_{j}"] for j in (0, 1)]
+        means = [recorded.values[f"rollout/ep_cost_{j}_mean"] for j in (0, 1)]
         assert means[1] == pytest.approx(2 * means[0])
         assert recorded.values["time/env_steps"] == 32
 
@@ -270,10 +272,10 @@ class TestLearning:
         env = line(n_worlds=32, gains=DIMINISHING)
         model = MAPPO(
             "MlpPolicy", env, n_steps=4, batch_size=256, n_epochs=4, gamma=1.0, seed=0,
-            learning_rate=3e-3, ent_coef=1.0, normalize_advantage=False, normalize_values=True,
-            device="cpu", **kwargs,
+            learning_rate=lambda progress: 5e-3 * progress, ent_coef=1.0, device="cpu",
+            normalize_advantage=False, normalize_values=True, **kwargs,
         )  # fmt: skip
-        model.learn(20_000)
+        model.learn(30_000)
         return model, evaluate_team(model, env, n_episodes=512, deterministic=False)
 
     def test_without_limit_the_team_earns_most_and_breaks_the_limit(self):
@@ -284,16 +286,16 @@ class TestLearning:
     @pytest.mark.parametrize("scope", ["team", "individual"])
     def test_under_a_limit_it_finds_the_multiplier_that_meets_it(self, scope):
         model, result = self.trained(cost_limits=4.0, cost_scope=scope)
-        assert result.mean_costs[0] == pytest.approx(4.0, abs=0.6)
-        assert result.mean_return == pytest.approx(20.2, abs=1.5)
-        assert model.multipliers.values.mean().item() == pytest.approx(2.5, abs=0.5)
+        assert result.mean_costs[0] == pytest.approx(4.0, abs=0.7)
+        assert result.mean_return == pytest.approx(20.2, abs=1.6)
+        assert 1.5 < model.multipliers.values.mean() < 4.5
 
     def test_pid_multipliers_find_it_too(self):
         gains = {"kp": 0.1, "ki": 0.05, "kd": 0.1}
         _, result = self.trained(
             cost_limits=4.0, multipliers_class=PIDMultipliers, multipliers_kwargs=gains
         )
-        assert result.mean_costs[0] == pytest.approx(4.0, abs=0.6)
+        assert result.mean_costs[0] == pytest.approx(4.0, abs=0.7)
 
 
 class TestSaving:

@@ -1,0 +1,642 @@
+"""The command line: what is trained, what is written, what is refused."""
+
+import base64
+import json
+import pickle
+import re
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_e2c import E2CMAPPO
+from sb3_e2c.envs import ENV_IDS
+from sb3_e2c.zoo import cli, demo, enjoy, hyperparams, train
+from sb3_e2c.zoo.build import make_worlds
+from sb3_e2c.zoo.console import UserError, parse_value, write_whole
+from sb3_e2c.zoo.hyperparams import FOLDER, merge, read_yaml, resolve
+from sb3_e2c.zoo.normalization import load_statistics, save_statistics
+from sb3_e2c.zoo.plots import plot_learning
+from sb3_e2c.zoo.runs import make_env, open_run
+
+ENV = "MultiRover-6-3-v0"
+N = 6
+# 2 worlds of 6 rovers for 80 steps: 960 agent steps a rollout
+SMALL = ["n_envs:2", "n_epochs:1", "batch_size:480", "policy_kwargs.net_arch:[8]"]
+ROLLOUT = 2 * N * 80
+
+TABLE_1 = {
+    "Clipping Coefficient": 0.2,
+    "Discount Factor": 0.9,
+    "GAE lambda": 0.95,
+    "Entropy Coefficient": 1e-3,
+    "Batch Size": 4096,
+    "Lag. Learning Rate": 0.05,
+    "Lag. Multiplier": 1.0,
+    "Actor Architecture": [128, 128],
+    "Critic Architecture": [128, 128],
+    "Activation Func.": "ReLU",
+    "Optimizer": "Adam",
+    "Quantization Level": 1,
+    "k in PEnvs": 5,
+    "k in Safe MaMuJoCo": 10,
+    "Episode Max. Len. in Rover Domain": 80,
+    "Episode Max. Len. in PEnvs": 80,
+    "Episode Max. Len. in Safe MaMuJoCo": 2000,
+}
+
+
+def run_train(folder, *flags, algo="e2c_t", steps=2 * ROLLOUT, params=()):
+    argv = ["--algo", algo, "--env", ENV, "-n", str(steps), "-f", str(folder), "--seed", "1"]
+    argv += ["--eval-freq", "-1", "--device", "cpu", "--verbose", "0"]
+    return train.train([*argv, *flags, "-params", *SMALL, *params])
+
+
+def run_enjoy(folder, *flags, algo="e2c_t"):
+    out = Path(folder) / "result.json"
+    argv = ["--algo", algo, "--env", ENV, "-f", str(folder), "--no-render", "--device", "cpu"]
+    enjoy.main([*argv, "--n-episodes", "4", "--n-envs", "2", "--json", str(out), *flags])
+    return json.loads(out.read_text())
+
+
+def refusal(capsys, main, argv):
+    """The one line that a command writes to stderr before it exits with status 2."""
+    with pytest.raises(SystemExit) as exit_:
+        main([str(word) for word in argv])
+    assert exit_.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("sb3-e2c: error: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A log folder with one small run, with checkpoints and evaluations."""
+    folder = tmp_path_factory.mktemp("logs")
+    flags = ["--save-freq", str(ROLLOUT), "--eval-freq", str(ROLLOUT), "--eval-episodes", "2"]
+    run_train(folder, *flags)
+    return folder
+
+
+@pytest.fixture
+def copy(trained, tmp_path):
+    """A log folder that a test may spoil."""
+    return shutil.copytree(trained, tmp_path / "logs")
+
+
+def run_folder(folder, number=1, algo="e2c_t"):
+    return Path(folder) / algo / f"{ENV}_{number}"
+
+
+# ---------------------------------------------------------------------------- hyperparameters
+
+
+def table_lines():
+    lines = [line for file in FOLDER.glob("*.yml") for line in file.read_text().splitlines()]
+    pattern = re.compile(r"^\s*\w+: (?:&\w+ )?(.+?)  # Table 1: (.+)$")
+    return [match.groups() for match in map(pattern.match, lines) if match]
+
+
+def test_every_number_of_table_1_stands_in_exactly_one_line():
+    assert sorted(name for _, name in table_lines()) == sorted(TABLE_1)
+
+
+@pytest.mark.parametrize(("value", "name"), table_lines())
+def test_the_line_has_the_number_of_the_table(value, name):
+    assert yaml.safe_load(value) == TABLE_1[name]
+
+
+def test_the_table_reaches_the_run():
+    config = resolve("c_mappo_pe", ENV)
+    assert (config["clip_range"], config["gamma"], config["gae_lambda"]) == (0.2, 0.9, 0.95)
+    assert (config["ent_coef"], config["batch_size"], config["n_steps"]) == (1e-3, 4096, 80)
+    assert config["multipliers_kwargs"] == {"learning_rate": 0.05, "initial": 0.0}
+
+
+def test_the_five_methods_are_settings_of_one_algorithm():
+    configs = {algo: resolve(algo, ENV) for algo in hyperparams.ALGORITHMS}
+    entropy = {algo for algo, config in configs.items() if config["ent_coef"] > 0}
+    individual = {a for a, config in configs.items() if config.get("cost_scope") == "individual"}
+    assert entropy == {"mappo", "c_mappo_pe"}
+    assert individual == {"c_mappo", "c_mappo_pe", "e2c"}
+    assert [a for a, config in configs.items() if config["cost_limits"] is None] == ["mappo"]
+    assert {a for a, config in configs.items() if "oem_kwargs" in config} == {"e2c", "e2c_t"}
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("algo", hyperparams.ALGORITHMS)
+def test_every_task_has_hyperparameters_for_every_method(env_id, algo):
+    config = resolve(algo, env_id)
+    n_agents = len(ENV_IDS[env_id](**config["env_kwargs"]).possible_agents)
+    assert config["n_envs"] * config["n_steps"] * n_agents >= 4096
+
+
+def test_shipped_files_have_only_keys_that_some_algorithm_reads():
+    known = set().union(*(hyperparams.keys(algo) for algo in hyperparams.ALGORITHMS))
+    tables = {name: read_yaml(FOLDER / f"{name}.yml") for name in ("envs", "algos", "presets")}
+    entries = [read_yaml(FOLDER / "defaults.yml")]
+    entries += [entry for table in tables.values() for entry in table.values()]
+    assert set().union(*entries) - {"base"} <= known
+    assert set(tables["algos"]) == set(hyperparams.ALGORITHMS)
+
+
+def test_presets_combine_and_parameters_come_last():
+    overrides = {"multipliers_kwargs": {"initial": 3.0}}
+    config = resolve("e2c_t", ENV, ["pure", "lambda_1", "literal_dual"], overrides)
+    assert config["oem_kwargs"]["psi"] is None
+    assert config["multipliers_kwargs"] == {
+        "learning_rate": 0.05,
+        "initial": 3.0,
+        "agent_scaling": False,
+    }
+
+
+def test_mappings_merge_without_changing_their_sources():
+    first, second = {"a": {"x": 1, "y": 2}}, {"a": {"y": 3}}
+    assert merge(first, second) == {"a": {"x": 1, "y": 3}}
+    assert first == {"a": {"x": 1, "y": 2}}
+
+
+def test_another_class_starts_with_its_own_arguments():
+    old = {"estimator": "visit_count", "estimator_kwargs": {"quantization": 1}, "psi": 0.1}
+    new = {"estimator": "nearest_neighbor", "estimator_kwargs": {"k": 5}}
+    assert merge(old, new) == {**new, "psi": 0.1}
+    assert merge(old, {"estimator": "visit_count"}) == old
+
+
+def test_pid_multipliers_start_with_their_own_arguments():
+    config = resolve("e2c_t", ENV, overrides={"multipliers_class": "PIDMultipliers"})
+    assert "multipliers_kwargs" not in config
+
+
+def test_another_policy_keeps_the_networks_of_table_1():
+    policy = merge({"policy": "A", "policy_kwargs": {"net_arch": [8]}}, {"policy": "B"})
+    assert policy["policy_kwargs"] == {"net_arch": [8]}
+
+
+def test_yaml_is_data_only(tmp_path):
+    file = tmp_path / "evil.yml"
+    file.write_text("a: !!python/object/apply:os.getcwd []")
+    with pytest.raises(UserError, match="cannot read"):
+        read_yaml(file)
+
+
+def test_numbers_without_a_dot_are_numbers(tmp_path):
+    (tmp_path / "a.yml").write_text("a: 3e-4\nb: 3.0e-4\nc: -1E5\nd: e5\n")
+    assert read_yaml(tmp_path / "a.yml") == {"a": 3e-4, "b": 3e-4, "c": -1e5, "d": "e5"}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3),
+        ("nearest_neighbor", "nearest_neighbor"),
+        ("'quoted'", "quoted"),
+        ("true", True),
+        ("None", None),
+        ("[64,64]", [64, 64]),
+        ("(1,2)", [1, 2]),
+        ("dict(net_arch=dict(pi=[8]))", {"net_arch": {"pi": [8]}}),
+        ("__import__('os').getcwd()", "__import__('os').getcwd()"),
+    ],
+)
+def test_values_on_the_command_line_are_read_never_executed(text, value):
+    assert parse_value(text) == value
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"gama": 0.9}, "unknown hyperparameter for e2c_t 'gama'; did you mean 'gamma'"),
+        ({"gamma": 1.5}, "gamma is 1.5; expected between 0 and 1"),
+        ({"n_steps": "many"}, "n_steps is 'many'; expected int"),
+        ({"n_epochs": True}, "n_epochs is True"),
+        ({"n_envs": -2}, "n_envs is -2; expected at least 1"),
+        ({"cost_limits": [-5.0]}, "cost_limits is .* expected at least 0"),
+        ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
+        ({"cost_scope": "both"}, "cost_scope is 'both'"),
+        ({"normalize": "dict(norm_obs=True)"}, "normalize is"),
+        ({"seed": 3}, "seed is no hyperparameter; use the flag --seed"),
+    ],
+)
+def test_a_wrong_hyperparameter_is_named(overrides, message):
+    with pytest.raises(UserError, match=message):
+        resolve("e2c_t", ENV, overrides=overrides)
+
+
+def test_a_key_of_another_method_is_refused_only_if_the_user_gave_it():
+    assert "oem_kwargs" not in resolve("mappo", ENV, ["pure"])
+    with pytest.raises(UserError, match="unknown hyperparameter for mappo 'oem_kwargs'"):
+        resolve("mappo", ENV, overrides={"oem_kwargs": {"psi": 0.1}})
+
+
+# ---------------------------------------------------------------------------- train
+
+
+def test_a_run_folder_has_everything(trained):
+    run = run_folder(trained)
+    names = {path.name for path in run.iterdir()}
+    assert {f"{ENV}.zip", "monitor.csv", "progress.csv", "best_model.zip"} <= names
+    assert {path.name for path in (run / ENV).iterdir()} == {
+        "config.yml",
+        "args.yml",
+        "command.txt",
+    }
+
+
+def test_the_saved_configuration_is_complete_and_plain(trained):
+    run = run_folder(trained)
+    config = yaml.safe_load((run / ENV / "config.yml").read_text())
+    assert config["policy_kwargs"]["net_arch"] == [8]
+    assert config["cost_limits"] == 20.0
+    assert config["oem_kwargs"]["psi"] == 0.05
+    assert config["env_kwargs"]["reward_at"] == "capture"
+    args = yaml.safe_load((run / ENV / "args.yml").read_text())
+    assert (args["algo"], args["env"], args["seed"]) == ("e2c_t", ENV, 1)
+    assert args["preset"] == "headline"
+    assert (run / ENV / "command.txt").read_text().startswith("python -m sb3_e2c.zoo.train --algo")
+
+
+def test_the_monitor_has_one_row_for_each_episode_of_a_world(trained):
+    table = pd.read_csv(run_folder(trained) / "monitor.csv", comment="#")
+    assert len(table) == 4  # 2 worlds, 2 rollouts of one episode
+    assert (table["l"] == 80).all()
+    assert table["cost"].notna().all()
+
+
+def test_the_log_has_the_multiplier(trained):
+    table = pd.read_csv(run_folder(trained) / "progress.csv")
+    lambdas = table[["time/total_timesteps", "train/lambda"]].dropna()
+    assert lambdas["time/total_timesteps"].iloc[-1] == 2 * ROLLOUT
+    assert (lambdas["train/lambda"] >= 0).all()
+
+
+def test_frequencies_count_agent_steps(trained):
+    run = run_folder(trained)
+    checkpoints = {path.name for path in run.glob("rl_model_*.zip")}
+    assert checkpoints == {f"rl_model_{k * ROLLOUT}_steps.zip" for k in (1, 2)}
+    evaluations = np.load(run / "evaluations.npz")
+    assert evaluations["timesteps"].tolist() == [ROLLOUT, 2 * ROLLOUT]
+    assert evaluations["results"].shape == (2, 2)  # 2 evaluations of 2 world episodes
+
+
+def test_the_same_seed_trains_the_same_team(trained, tmp_path):
+    again = run_train(tmp_path)
+    first, second = (
+        E2CMAPPO.load(run / f"{ENV}.zip", device="cpu") for run in (run_folder(trained), again)
+    )
+    for one, other in zip(first.policy.parameters(), second.policy.parameters(), strict=True):
+        assert one.equal(other)
+
+
+def test_continuing_goes_on_with_counters_and_configuration(copy):
+    start = run_folder(copy) / f"{ENV}.zip"
+    argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(start), "--seed", "2"]
+    run = train.train([*argv, "--eval-freq", "-1", "--verbose", "0", "-params", "n_epochs:2"])
+    assert run == run_folder(copy, 2)
+    assert E2CMAPPO.load(run / f"{ENV}.zip").num_timesteps == 3 * ROLLOUT
+    config = read_yaml(run / ENV / "config.yml")
+    assert (config["n_envs"], config["n_epochs"]) == (2, 2)  # of the first run; of the user
+    assert pd.read_csv(run / "progress.csv")["time/total_timesteps"].iloc[-1] == 3 * ROLLOUT
+
+
+def test_continuing_refuses_what_would_be_another_experiment(copy, capsys):
+    start = run_folder(copy) / f"{ENV}.zip"
+    argv = ["--env", ENV, "-f", copy, "-i", start, "-params", "cost_limits:1.0"]
+    assert "cannot become 1.0" in refusal(capsys, train.main, argv)
+    assert not run_folder(copy, 2).exists()
+
+
+def test_continuing_refuses_another_method(copy, capsys):
+    start = run_folder(copy) / f"{ENV}.zip"
+    argv = ["--algo", "e2c", "--env", ENV, "-f", copy, "-i", start]
+    assert "was trained with --algo e2c_t" in refusal(capsys, train.main, argv)
+
+
+def test_other_multipliers_and_estimators_can_be_named(tmp_path):
+    params = ["multipliers_class:PIDMultipliers", "oem_kwargs.estimator:nearest_neighbor"]
+    run = run_train(tmp_path, steps=ROLLOUT, params=[*params, "oem_kwargs.estimator_kwargs.k:3"])
+    oem = read_yaml(run / ENV / "config.yml")["oem_kwargs"]
+    assert oem["estimator_kwargs"] == {"k": 3}
+    run_enjoy(tmp_path)
+
+
+def test_normalized_observations_are_evaluated_with_the_statistics_of_training(tmp_path):
+    flags = ["--save-freq", str(ROLLOUT), "--eval-freq", str(ROLLOUT), "--eval-episodes", "2"]
+    run = run_train(tmp_path, *flags, params=["normalize:True"])
+    for path in (f"{ENV}.zip", "best_model.zip", f"rl_model_{ROLLOUT}_steps.zip"):
+        assert (run / path).with_suffix(".vecnormalize.npz").is_file()
+    plain = run_enjoy(tmp_path)
+    (run / f"{ENV}.vecnormalize.npz").unlink()
+    assert run_enjoy(tmp_path, "--trust") == plain  # from RL-Zoo's pickle
+
+
+def test_statistics_survive_without_a_pickle(tmp_path):
+    env = VecNormalize(make_worlds(ENV, {}, 1, seed=0), gamma=0.5, norm_reward=False)
+    env.reset()
+    env.obs_rms.mean[:], env.obs_rms.var[:] = 3.0, 4.0
+    save_statistics(env, tmp_path / "a.vecnormalize.npz")
+    loaded = load_statistics(make_worlds(ENV, {}, 1, seed=0), tmp_path / "a.vecnormalize.npz")
+    observation = np.full(env.observation_space.shape, 5.0)
+    assert loaded.normalize_obs(observation) == pytest.approx((5 - 3) / 2)
+    assert (loaded.gamma, loaded.norm_reward) == (0.5, False)
+
+
+def test_evaluation_does_not_change_the_statistics(tmp_path):
+    run = open_run(run_train(tmp_path, steps=ROLLOUT, params=["normalize:True"]), "e2c_t", ENV)
+    env = make_env(run, n_worlds=1, seed=0)
+    before = env.obs_rms.mean.copy()
+    env.reset()
+    env.step(np.ones((N, 2)))
+    assert np.array_equal(env.obs_rms.mean, before)
+
+
+def test_normalization_without_plain_statistics_is_refused(tmp_path, capsys):
+    run = run_train(tmp_path, params=["normalize:True"])
+    (run / f"{ENV}.vecnormalize.npz").unlink()
+    assert "cannot read the observation statistics" in refusal(
+        capsys, enjoy.main, ["--env", ENV, "-f", tmp_path]
+    )
+
+
+@pytest.mark.parametrize("algo", ["mappo", "c_mappo", "c_mappo_pe", "e2c"])
+def test_every_method_trains_and_evaluates(tmp_path, algo):
+    run_train(tmp_path, algo=algo, steps=ROLLOUT)
+    result = run_enjoy(tmp_path, algo=algo)
+    assert result["constrained"] == (algo != "mappo")
+    assert result["cost_limits"] == [20.0]
+
+
+def test_worker_processes_can_be_asked_for(tmp_path):
+    run = run_train(tmp_path, "--vec-env", "subproc", steps=ROLLOUT)
+    assert len(pd.read_csv(run / "monitor.csv", comment="#")) == 2
+
+
+def test_tensorboard_gets_the_same_numbers(tmp_path):
+    run_train(tmp_path / "logs", "-tb", str(tmp_path / "tb"), steps=ROLLOUT)
+    assert list((tmp_path / "tb" / ENV / "e2c_t_1").glob("events*"))
+
+
+def test_a_preset_needs_no_quotes_and_is_recorded(tmp_path):
+    run = run_train(tmp_path, "--preset", "pure,lambda_1", steps=ROLLOUT)
+    config = read_yaml(run / ENV / "config.yml")
+    assert config["oem_kwargs"]["psi"] is None
+    assert read_yaml(run / ENV / "args.yml")["preset"] == "pure,lambda_1"
+
+
+def test_hyperparameters_come_from_a_file_too(tmp_path):
+    conf = tmp_path / "mine.yml"
+    conf.write_text("default: {gamma: 0.8}\n")
+    run = run_train(tmp_path / "logs", "-conf", str(conf), steps=ROLLOUT)
+    assert read_yaml(run / ENV / "config.yml")["gamma"] == 0.8
+
+
+def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        train.main(["--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    assert "--preset" in text
+    assert "--save-freq" in text
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env", "MultiRover-6-33-v0"], "did you mean 'MultiRover-6-3-v0'"),
+        (["--algo", "e2c-t"], "did you mean 'e2c_t'"),
+        (["--preset", "puer"], "did you mean 'pure'"),
+        (["-params", "gama:0.9"], "did you mean 'gamma'"),
+        (["-params", "gamma:high"], "gamma is 'high'"),
+        (["-params", "gamma"], "expected key:value"),
+        (["-params", "policy_kwargs.net_arhc:[8]"], "net_arhc"),
+        (["-params", "policy_kwargs.activation_fn:RELU"], "did you mean 'ReLU'"),
+        (["-params", "policy:MlpPolcy"], "did you mean 'MlpPolicy'"),
+        (["-params", "batch_size:3"], "batch_size is 3, smaller than the team of 6"),
+        (["-params", "cost_limits:[1.0,2.0]"], "there are 2 cost limits"),
+        (["-params", "oem_kwargs.estimator:novelty"], "novelty"),
+        (["-params", "callback:no.such.Callback"], "no.such.Callback"),
+        (["--env-kwargs", "max_cylces:10"], "did you mean 'max_cycles'"),
+        (["--env-kwargs", "max_cycles:0"], "max_cycles is 0"),
+        (["--eval-env-kwargs", "max_cycles:0"], "max_cycles is 0"),
+        (["-n", "-5"], "--n-timesteps is -5"),
+        (["-n", "many"], "invalid int value: 'many'"),
+        (["--eval-episodes", "0"], "--eval-episodes is 0"),
+        (["--n-eval-envs", "-1"], "--n-eval-envs is -1"),
+        (["--log-interval", "0"], "--log-interval is 0"),
+        (["--seed", str(2**32)], "--seed is 4294967296"),
+        (["--device", "gpu"], "--device is 'gpu'"),
+        (["--flag"], "unrecognized arguments: --flag"),
+        (["-i", "missing.zip"], "-i missing.zip"),
+        (["-conf", "missing.yml"], "cannot read missing.yml"),
+        (["-optimize"], "-optimize"),
+        (["--gym-packages", "no_such_package"], "no_such_package"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing_behind(tmp_path, capsys, flags, message):
+    argv = ["--env", ENV, "-f", tmp_path / "logs", "-n", "960", "--device", "cpu", *flags]
+    assert message in refusal(capsys, train.main, argv)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    assert "cannot write there" in refusal(capsys, train.main, ["--env", ENV, "-f", file / "logs"])
+
+
+def test_continuing_from_a_broken_file_is_refused(tmp_path, capsys):
+    file = tmp_path / "model.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("data", "{}")
+    argv = ["--env", ENV, "-f", tmp_path / "logs", "-i", file]
+    assert "cannot continue from" in refusal(capsys, train.main, argv)
+    assert not (tmp_path / "logs").exists()
+
+
+# ---------------------------------------------------------------------------- enjoy
+
+
+def test_enjoy_reports_the_team(trained, capsys):
+    result = run_enjoy(trained)
+    assert result["episodes"] == 4
+    assert 0 <= result["team_return"] <= 1
+    assert result["team_cost"] >= 0
+    assert result["cost_limits"] == [20.0]
+    assert 0 <= result["violation_rate"] <= 1
+    assert result["deterministic"] is False
+    assert (result["seed"], result["algo"], result["env"]) == (0, "e2c_t", ENV)
+    assert Path(result["model"]) == run_folder(trained) / f"{ENV}.zip"
+    assert "sampled actions" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_a_progress_bar_changes_nothing(trained):
+    assert run_enjoy(trained, "-P") == run_enjoy(trained)
+
+
+@pytest.mark.parametrize(
+    ("flags", "deterministic"),
+    [([], False), (["--stochastic"], False), (["--deterministic"], True)],
+)
+def test_enjoy_repeats_itself(trained, flags, deterministic):
+    first, second = (run_enjoy(trained, *flags, "--seed", "3") for _ in range(2))
+    assert first == second
+    assert first["deterministic"] is deterministic
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        (["--load-best"], "best_model.zip"),
+        (["--load-checkpoint", str(ROLLOUT)], f"rl_model_{ROLLOUT}_steps.zip"),
+        (["--load-last-checkpoint"], f"rl_model_{2 * ROLLOUT}_steps.zip"),
+    ],
+)
+def test_enjoy_loads_other_models_of_the_run(trained, flags, name):
+    assert Path(run_enjoy(trained, *flags)["model"]).name == name
+
+
+def test_weights_alone_give_the_same_team_as_the_whole_file(trained):
+    assert run_enjoy(trained) == run_enjoy(trained, "--trust")
+
+
+class Payload:
+    """Unpickling it creates a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_no_pickle_of_the_model_file_is_executed(copy, tmp_path):
+    trace = tmp_path / "executed"
+    payload = base64.b64encode(pickle.dumps(Payload(trace))).decode()
+    poison = {":type:": "Payload", ":serialized:": payload}
+    honest = run_enjoy(copy)
+    model = run_folder(copy) / f"{ENV}.zip"
+    rewrite(model, "data", lambda text: json.dumps({**json.loads(text), "poison": poison}))
+    assert run_enjoy(copy) == honest
+    assert not trace.exists()
+    run_enjoy(copy, "--trust")
+    assert trace.exists()
+
+
+def rewrite(archive, name, change):
+    """Change one member of a zip file."""
+    with zipfile.ZipFile(archive) as file:
+        members = {each: file.read(each) for each in file.namelist()}
+    members[name] = change(members[name].decode()).encode()
+    with zipfile.ZipFile(archive, "w") as file:
+        for each, content in members.items():
+            file.writestr(each, content)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_enjoy_films_one_episode(trained, tmp_path, suffix):
+    film = tmp_path / f"episode.{suffix}"
+    run_enjoy(trained, "--video", str(film))
+    assert film.stat().st_size > 10_000
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env", "MultiRover-6-33-v0"], "did you mean 'MultiRover-6-3-v0'"),
+        (["--algo", "e2ct"], "did you mean 'e2c_t'"),
+        (["--algo", "mappo"], "sb3-e2c train --algo mappo"),
+        (["--exp-id", "7"], f"{ENV}_7"),
+        (["--load-checkpoint", "7"], "rl_model_7_steps.zip"),
+        (["--n-episodes", "0"], "--n-episodes is 0"),
+        (["--n-envs", "-1"], "--n-envs is -1"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--deterministic", "--stochastic"], "exclude each other"),
+        (["--video", "film.txt"], ".gif or .mp4"),
+        (["--json", "/dev/null/out.json"], "cannot write there"),
+        (["--env-kwargs", "max_cylces:10"], "did you mean 'max_cycles'"),
+        (["--env-kwargs", "n_rovers:8"], "does not fit"),
+        (["--device", "gpu"], "--device is 'gpu'"),
+    ],
+)
+def test_a_mistake_in_enjoy_is_one_line(trained, capsys, flags, message):
+    argv = ["--env", ENV, "-f", trained, "--device", "cpu", "--n-episodes", "1", *flags]
+    assert message in refusal(capsys, enjoy.main, argv)
+
+
+def test_a_missing_folder_is_one_line(tmp_path, capsys):
+    assert "was not found" in refusal(capsys, enjoy.main, ["--env", ENV, "-f", tmp_path / "none"])
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip file", None])
+def test_a_broken_model_is_one_line(copy, capsys, content):
+    model = run_folder(copy) / f"{ENV}.zip"
+    model.write_bytes(model.read_bytes()[:5000] if content is None else content)
+    assert "no readable model" in refusal(capsys, enjoy.main, ["--env", ENV, "-f", copy])
+
+
+def test_a_model_of_another_method_is_one_line(copy, capsys):
+    other = run_train(copy, algo="mappo", steps=ROLLOUT)
+    shutil.copy(other / f"{ENV}.zip", run_folder(copy) / f"{ENV}.zip")
+    assert "does not fit" in refusal(capsys, enjoy.main, ["--env", ENV, "-f", copy])
+
+
+def test_a_run_under_another_name_is_one_line(copy, capsys):
+    shutil.copytree(copy / "e2c_t", copy / "e2c")
+    argv = ["--algo", "e2c", "--env", ENV, "-f", copy]
+    assert "was trained with --algo e2c_t, not e2c" in refusal(capsys, enjoy.main, argv)
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "result.json"
+    write_whole(path, "old")
+    with pytest.raises(TypeError):
+        write_whole(path, 3)  # type: ignore[arg-type]
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# ---------------------------------------------------------------------------- plots, demo, cli
+
+
+def test_the_plot_is_a_picture_in_the_run_folder(copy):
+    picture = plot_learning(run_folder(copy))
+    assert picture == run_folder(copy) / "learning.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plotting_something_else_is_one_line(tmp_path, capsys):
+    assert "not the folder of one run" in refusal(capsys, cli.main, ["plots", tmp_path])
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_the_demo_trains_evaluates_films_and_draws(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demo, "EPISODES", 2)
+    monkeypatch.setattr(demo, "WORLDS", 2)
+    demo.main(["-n", "4800", "-f", str(tmp_path)])
+    text = capsys.readouterr().out
+    for words in ("team reward", "team cost", "cost limit", "lambda", "agent steps per second"):
+        assert words in text
+    run = run_folder(tmp_path)
+    assert (run / "learning.png").is_file()
+    assert (run / "episode.gif").is_file()
+
+
+def test_the_console_command_suggests(capsys):
+    assert "did you mean 'train'" in refusal(capsys, cli.main, ["trian"])
+
+
+def test_the_console_command_lists_its_commands(capsys):
+    cli.main(["--help"])
+    assert "enjoy" in capsys.readouterr().out

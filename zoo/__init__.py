@@ -1,0 +1,1 @@
+"""Train, evaluate, film and plot teams from the command line, in the manner of RL-Zoo."""

@@ -1,0 +1,33 @@
+"""Console command ``sb3-e2c train|enjoy|demo|plot``."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from sb3_e2c.zoo.console import fail, unknown
+
+COMMANDS = {
+    "train": "train a team",
+    "enjoy": "evaluate a trained team",
+    "demo": "train, evaluate and film one team in a few minutes",
+    "plots": "draw the learning curves of a run",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run a command.
+
+    :param argv: The command and its flags; default: those of this process
+    """
+    command, *flags = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    if command in ("-h", "--help"):
+        print("usage: sb3-e2c COMMAND [FLAGS]; each command has --help\n")
+        print("\n".join(f"  {name:<6} {text}" for name, text in COMMANDS.items()))
+    elif command not in COMMANDS:
+        fail(unknown("command", command, COMMANDS))
+    else:
+        importlib.import_module(f"sb3_e2c.zoo.{command}").main(flags)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""Evaluate a trained team: ``python -m sb3_e2c.zoo.enjoy --algo e2c_t --env MultiRover-6-3-v0``.
+
+The model is rebuilt from the run's config.yml, and only its weights are read from the zip file, so
+that a downloaded file cannot execute anything (unless you --trust it).
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.utils import set_random_seed
+from tqdm.auto import tqdm
+
+from sb3_e2c import MAPPO, evaluate_team
+from sb3_e2c.evaluation import TeamEvaluation
+from sb3_e2c.zoo.console import (
+    ConsoleParser,
+    StoreDict,
+    UserError,
+    check_device,
+    check_writable,
+    one_line_errors,
+    write_whole,
+)
+from sb3_e2c.zoo.hyperparams import ALGORITHMS, team_limits
+from sb3_e2c.zoo.runs import Run, find_run, load_model, make_env, record_episode
+
+
+def make_parser() -> ConsoleParser:
+    """The flags of ``enjoy``: RL-Zoo's names, and ``--n-episodes --json --video --trust``."""
+    parser = ConsoleParser(prog="sb3-e2c enjoy", description=(__doc__ or "").split("\n\n")[1])
+    add, switch = parser.add_argument, "store_true"
+    add("--algo", default="e2c_t", help=f"{', '.join(ALGORITHMS)} (default: e2c_t)")
+    add("--env", default="MultiRover-6-3-v0", help="environment ID")
+    add("-f", "--folder", default="logs", help="log folder (default: logs)")
+    add("--exp-id", type=int, default=0, help="number of the run (default: the latest)")
+    add("--load-best", action=switch, help="load the best model instead of the last")
+    add("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
+    add("--load-last-checkpoint", action=switch, help="load the last checkpoint")
+    add("--n-episodes", type=int, default=100, help="episodes of the team (default: 100)")
+    add("--n-envs", type=int, default=10, help="worlds at a time (default: 10)")
+    add("--deterministic", action=switch, help="take the most likely actions")
+    add(
+        "--stochastic",
+        action=switch,
+        help="sample actions (the default: the limits were trained for the sampled policy)",
+    )
+    add("--seed", type=int, default=0, help="of worlds and sampled actions (default: 0)")
+    add("--env-kwargs", nargs="+", action=StoreDict, metavar="KEY:VALUE", help="changed arguments")
+    add("--device", default="auto", help="torch device (default: auto)")
+    add(
+        "--no-render",
+        action=switch,
+        help="accepted as RL-Zoo's flag: there is never a window; see --video",
+    )
+    add("--json", type=Path, metavar="FILE", help="write the results to FILE")
+    add("--video", type=Path, metavar="FILE", help="film one episode (.gif or .mp4)")
+    add("--trust", action=switch, help="unpickle the model: it can then execute code")
+    add("-P", "--progress", action=switch, help="progress bar")
+    add("--verbose", type=int, default=1, help="0: print nothing")
+    return parser
+
+
+def _check(args: argparse.Namespace) -> None:
+    for name in ("n_episodes", "n_envs"):
+        if getattr(args, name) < 1:
+            flag = f"--{name.replace('_', '-')}"
+            raise UserError(f"{flag} is {getattr(args, name)}; expected at least 1")
+    if not 0 <= args.seed < 2**32:
+        raise UserError(f"--seed is {args.seed}; expected a number from 0 to 2**32 - 1")
+    if args.deterministic and args.stochastic:
+        raise UserError("--deterministic and --stochastic exclude each other; give one of them")
+    check_device(args.device)
+    for flag, path in (("--json", args.json), ("--video", args.video)):
+        if path is not None:
+            check_writable(path.parent, flag)
+    if args.video is not None and args.video.suffix not in (".gif", ".mp4"):
+        raise UserError(f"--video is {args.video}; expected a name that ends in .gif or .mp4")
+
+
+def summarize(run: Run, model: MAPPO, result: TeamEvaluation, **settings: Any) -> dict[str, Any]:
+    """What ``--json`` writes: means over episodes with their standard errors (``_se``).
+
+    :param run: The run
+    :param model: Its model
+    :param result: Its evaluation, E episodes
+    :param settings: Further entries
+    """
+    limits = team_limits(run.env_id, run.config)
+    costs = result.costs
+    return {
+        "algo": run.algo,
+        "env": run.env_id,
+        "model": str(run.model_path),
+        "episodes": len(result.returns),
+        **settings,
+        "team_return": float(result.returns.mean()),
+        "team_return_se": float(standard_error(result.returns)),
+        "team_cost": _plain(costs.mean(axis=0)),
+        "team_cost_se": _plain(standard_error(costs)),
+        "cost_limits": limits,
+        "constrained": bool(len(model.cost_limits)),
+        "violation_rate": result.violation_rate(limits) if limits and costs.size else None,
+        "episode_length": float(result.lengths.mean()),
+        "lambda": _plain(model.multipliers.state_dict()["values"].mean(dim=0).tolist()),
+    }
+
+
+def standard_error(samples: np.ndarray) -> np.ndarray:
+    """Standard error of the mean over the first axis; 0 for a single sample.
+
+    :param samples: Shape (E, ...)
+    :return: Shape (...)
+    """
+    if len(samples) < 2:
+        return np.zeros(samples.shape[1:])
+    return samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+
+
+def _plain(numbers: Any) -> Any:
+    """A float for one number, a list for several, None for none."""
+    values = [float(number) for number in numbers]
+    return values[0] if len(values) == 1 else values or None
+
+
+def report(summary: dict[str, Any]) -> str:
+    """The summary for a person.
+
+    :param summary: See :func:`summarize`
+    """
+    actions = "most likely actions" if summary["deterministic"] else "sampled actions"
+    lines = [
+        str(summary["model"]),
+        f"{summary['episodes']} episodes of the team, {actions}, seed {summary['seed']}",
+        f"return     {_mean(summary['team_return'], summary['team_return_se'])}",
+    ]
+    if summary["team_cost"] is not None:
+        limits = ", ".join(f"{limit:g}" for limit in summary["cost_limits"])
+        imposed = "limit" if summary["constrained"] else "not constrained; the task's limit"
+        lines.append(
+            f"cost       {_mean(summary['team_cost'], summary['team_cost_se'])}  "
+            f"({imposed} {limits or 'unknown'})"
+        )
+    if summary["violation_rate"] is not None:
+        lines.append(f"violation  {summary['violation_rate']:.1%} of the episodes over the limit")
+    if summary["lambda"] is not None:
+        numbers = ", ".join(f"{number:.3f}" for number in np.atleast_1d(summary["lambda"]))
+        lines.append(f"lambda     {numbers}")
+    return "\n".join(lines)
+
+
+def _mean(mean: Any, error: Any) -> str:
+    pairs = zip(np.atleast_1d(mean), np.atleast_1d(error), strict=True)
+    return ", ".join(f"{m:.3f} ± {e:.3f}" for m, e in pairs)
+
+
+def enjoy(args: argparse.Namespace) -> dict[str, Any]:
+    """Evaluate, and film if asked.
+
+    :param args: See :func:`make_parser`
+    :return: See :func:`summarize`
+    """
+    _check(args)
+    run = find_run(args)
+    set_random_seed(args.seed)
+    settings = {"deterministic": args.deterministic, "seed": args.seed}
+    with closing(make_env(run, args.n_envs, args.seed, args.env_kwargs, args.trust)) as env:
+        model = load_model(run, env, args.seed, args.device, args.trust)
+        with closing(tqdm(total=args.n_episodes, disable=not args.progress)) as bar:
+            result = evaluate_team(
+                model,
+                env,
+                args.n_episodes,
+                settings["deterministic"],
+                callback=lambda locals_, _: bar.update(int(locals_["done"])),
+            )
+    if args.video is not None:
+        kwargs = {**(args.env_kwargs or {}), "render_mode": "rgb_array"}
+        with closing(make_env(run, 1, args.seed, kwargs, args.trust)) as env:
+            record_episode(model, env, args.video, settings["deterministic"])
+    return summarize(run, model, result, **settings)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Console command ``sb3-e2c enjoy``.
+
+    :param argv: Flags; default: those of this process
+    """
+    args = make_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    with one_line_errors():
+        summary = enjoy(args)
+        if args.json is not None:
+            write_whole(args.json, json.dumps(summary, indent=2) + "\n")
+        if args.verbose > 0:
+            print(report(summary))
+
+
+if __name__ == "__main__":
+    main()

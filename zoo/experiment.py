@@ -1,0 +1,335 @@
+"""RL-Zoo's ``ExperimentManager`` for teams: worlds instead of environments, episodes of worlds."""
+
+import contextlib
+import os
+import shlex
+import warnings
+from argparse import Namespace
+from copy import deepcopy
+from pathlib import Path
+from pprint import pprint
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS, get_callback_list
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    ProgressBarCallback,
+)
+from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.utils import get_latest_run_id
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_e2c import MAPPO, TeamEvalCallback
+from sb3_e2c.constraints import check_n_costs, read_costs
+from sb3_e2c.envs import ENV_IDS
+from sb3_e2c.monitor import TeamMonitor
+from sb3_e2c.zoo.build import build_model, constructor_arguments, make_worlds
+from sb3_e2c.zoo.console import UserError, write_whole
+from sb3_e2c.zoo.hyperparams import ALGORITHMS, merge, parse_presets, read_yaml, resolve
+from sb3_e2c.zoo.normalization import load_statistics, save_statistics, statistics_path
+
+# What a continued run may change: numbers that a loaded model reads anew in each rollout.
+_CHANGEABLE = (
+    *("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "vf_coef", "max_grad_norm"),
+    *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "reward_scale"),
+)
+
+
+def _no_single_agent(**_: Any) -> gym.Env:
+    raise TypeError("this id names a PettingZoo environment; see sb3_e2c.envs.ENV_IDS")
+
+
+def register() -> None:
+    """Tell RL-Zoo the names of our algorithms and environments."""
+    ALGOS.update(ALGORITHMS)
+    for env_id in ENV_IDS:
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point=_no_single_agent)
+
+
+def configuration(args: Namespace) -> dict[str, Any]:
+    """The configuration that a ``train`` command line asks for.
+
+    :param args: Parsed flags of ``train``
+    :raises UserError: for anything in it that cannot be meant
+    """
+    overrides = merge(
+        _conf_file(args), {"env_kwargs": args.env_kwargs or {}}, args.hyperparams or {}
+    )
+    base = _continued_configuration(args)
+    config = resolve(args.algo, args.env, parse_presets(args.preset), overrides, base)
+    if base is not None:
+        _check_changes(base, config)
+    return config
+
+
+def _conf_file(args: Namespace) -> dict[str, Any]:
+    if args.conf_file is None:
+        return {}
+    content = read_yaml(args.conf_file)
+    entry = content.get(args.env, content.get("default"))
+    if not isinstance(entry, dict):
+        raise UserError(f"{args.conf_file} has neither an entry {args.env} nor 'default'")
+    return entry
+
+
+def _continued_configuration(args: Namespace) -> dict[str, Any] | None:
+    """What the run to be continued was trained with, if it lies where ``train`` puts it."""
+    saved = Path(args.trained_agent).parent / args.env
+    if not (args.trained_agent and (saved / "config.yml").is_file()):
+        return None
+    algo = read_yaml(saved / "args.yml").get("algo")
+    if algo != args.algo:
+        raise UserError(f"-i {args.trained_agent} was trained with --algo {algo}, not {args.algo}")
+    return read_yaml(saved / "config.yml")
+
+
+def _check_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
+    ours = set(new) - {"n_envs", "n_timesteps", "env_kwargs", "normalize", "callback"}
+    for key in sorted(ours - set(_CHANGEABLE)):
+        if new[key] != old.get(key):
+            raise UserError(
+                f"{key} was {old.get(key)!r} in the run to be continued (-i) and cannot become "
+                f"{new[key]!r}; start a new run"
+            )
+
+
+class TeamExperimentManager(ExperimentManager):
+    """Builds, trains and saves a team; see RL-Zoo for the arguments.
+
+    :param args: As RL-Zoo's, the first being the parsed flags of ``train``
+    :param command: How to run the same again
+    :param kwargs: As RL-Zoo's
+    """
+
+    def __init__(self, *args: Any, command: list[str], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.command = command
+        self.deterministic_eval = False  # limits hold for the policy that is trained: the sampled
+        self.env_id = self.args.env
+        self.n_slots = 0
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]]:
+        """Build everything; nothing is written before all of it has been built once.
+
+        :return: The model, and the configuration of the run
+        """
+        config = configuration(self.args)
+        self.n_envs = config["n_envs"]
+        self.n_timesteps = self.n_timesteps if self.n_timesteps > 0 else config["n_timesteps"]
+        self.env_kwargs = config.get("env_kwargs") or {}
+        self._preprocess_normalization(deepcopy(config))
+        self.callbacks = self._own_callbacks(config)
+        self._rehearse(config)
+        if self.verbose > 0:
+            self._describe(config)
+        self.create_log_folder()
+        self.create_callbacks()
+        model = self._make_model(config, self.create_envs(self.n_envs), self.verbose)
+        self._save_config(config)
+        return model, config
+
+    def _own_callbacks(self, config: dict[str, Any]) -> list[BaseCallback]:
+        try:
+            return get_callback_list(config)
+        except (ImportError, AttributeError, TypeError, ValueError, AssertionError) as error:
+            raise UserError(f"callback {config['callback']!r}: {error}") from error
+
+    def _rehearse(self, config: dict[str, Any]) -> None:
+        """Build worlds and model once without a trace, so that mistakes show before the run."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they will be seen in earnest
+            with contextlib.closing(self.create_envs(self.n_eval_envs, eval_env=True)) as env:
+                env.reset()
+            with contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env:
+                self.n_slots = env.num_envs
+                self._step_once(self._make_model(config, env, verbose=0))
+
+    @staticmethod
+    def _step_once(model: MAPPO) -> None:
+        """See whether the environment reports the costs that are limited."""
+        env = model.env
+        assert env is not None
+        env.reset()
+        actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
+        try:
+            infos = env.step(actions)[-1]
+            if len(model.cost_limits):
+                costs = read_costs(infos, model.agents)
+                check_n_costs(costs, len(model.cost_limits), model.agents)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+
+    def _make_model(self, config: dict[str, Any], env: VecEnv, verbose: int) -> MAPPO:
+        flags: dict[str, Any] = {"seed": self.seed, "device": self.device, "verbose": verbose}
+        if not self.continue_training:
+            return build_model(self.algo, config, env, **flags)
+        changes = constructor_arguments({k: config[k] for k in _CHANGEABLE if k in config})
+        try:
+            return ALGORITHMS[self.algo].load(self.trained_agent, env=env, **flags, **changes)
+        except Exception as error:  # whatever a broken or foreign pickle may raise
+            raise UserError(f"cannot continue from {self.trained_agent}: {error}") from error
+
+    def _describe(self, config: dict[str, Any]) -> None:
+        n_agents = self.n_slots // self.n_envs
+        print(f"{self.n_envs} worlds of {n_agents} agents: {self.n_slots} agent steps at a time")
+        pprint(config)
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """Make worlds, with one monitor row for each of their episodes.
+
+        :param n_envs: W
+        :param eval_env: Whether it is for evaluation: seeds of its own, one process
+        :param no_log: Whether not to write monitor.csv
+        """
+        parallel = not eval_env and self.args.vec_env == "subproc"
+        env = make_worlds(
+            self.env_id,
+            merge(self.env_kwargs, self.args.eval_env_kwargs or {})
+            if eval_env
+            else self.env_kwargs,
+            n_envs,
+            seed=self.seed + self.n_envs if eval_env else self.seed,
+            n_processes=min(n_envs, os.cpu_count() or 1) if parallel else 1,
+        )
+        log = None if eval_env or no_log else os.path.join(self.save_path, "monitor.csv")
+        return self._maybe_normalize(TeamMonitor(env, log), eval_env)
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """Add ``normalize:``; a continued run goes on with its statistics."""
+        if not self.normalize:
+            return env
+        if self.continue_training:
+            env = load_statistics(env, statistics_path(self.trained_agent))
+        else:
+            env = VecNormalize(env, **self.normalize_kwargs)
+        if eval_env:
+            env.training = env.norm_reward = False
+        return env
+
+    def create_callbacks(self) -> None:
+        """Progress bar, checkpoints and evaluation; frequencies count agent steps."""
+        if self.show_progress:
+            self.callbacks.append(ProgressBarCallback())
+        if self.save_freq > 0:
+            self.callbacks.append(
+                _Checkpoint(self._calls(self.save_freq), self.save_path, save_vecnormalize=True)
+            )
+        if self.eval_freq > 0:
+            best = Path(self.save_path) / "best_model.zip"
+            self.callbacks.append(
+                TeamEvalCallback(
+                    self.create_envs(self.n_eval_envs, eval_env=True),
+                    callback_on_new_best=_SaveStatistics(statistics_path(best)),
+                    best_model_save_path=self.save_path,
+                    n_eval_episodes=self.n_eval_episodes,
+                    log_path=self.save_path,
+                    eval_freq=self._calls(self.eval_freq),
+                    deterministic=self.deterministic_eval,
+                    verbose=self.verbose,
+                )
+            )
+
+    def _calls(self, agent_steps: int) -> int:
+        """How many calls of ``env.step`` make so many agent steps."""
+        return max(agent_steps // self.n_slots, 1)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """Train; a continued run keeps its step counter and ends ``n_timesteps`` later.
+
+        :param model: What :meth:`setup_experiment` built
+        """
+        model.set_logger(self._logger())
+        log_interval = {-1: 1, -2: None}.get(self.log_interval, self.log_interval)
+        try:
+            model.learn(
+                self.n_timesteps,
+                callback=self.callbacks,
+                log_interval=log_interval,  # type: ignore[arg-type]
+                reset_num_timesteps=not self.continue_training,
+            )
+        except KeyboardInterrupt:
+            print("Interrupted: saving what has been learned")
+        finally:
+            self._release(model)
+
+    def _release(self, model: BaseAlgorithm) -> None:
+        """Write the log of the last update, then close logs, progress bar and worlds."""
+        model.logger.record("time/total_timesteps", model.num_timesteps)
+        model.logger.dump(model.num_timesteps)
+        model.logger.close()
+        for callback in self.callbacks:
+            if isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
+                callback.pbar.close()
+            if isinstance(callback, TeamEvalCallback):
+                callback.eval_env.close()
+        assert model.env is not None
+        model.env.close()
+
+    def _logger(self) -> Logger:
+        """progress.csv in the run folder; tables with ``--verbose 1``; TensorBoard with ``-tb``."""
+        formats = [make_output_format("csv", self.save_path)]
+        if self.verbose > 0:
+            formats.append(make_output_format("stdout", self.save_path))
+        if self.tensorboard_log is not None:
+            run = get_latest_run_id(self.tensorboard_log, self.algo) + 1
+            folder = os.path.join(self.tensorboard_log, f"{self.algo}_{run}")
+            formats.append(make_output_format("tensorboard", folder))
+        return Logger(self.save_path, formats)
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """Save the model, and what ``normalize:`` has measured, as RL-Zoo names them.
+
+        :param model: The trained model
+        """
+        path = Path(self.save_path) / f"{self.env_name}.zip"
+        if self.verbose > 0:
+            print(f"Saving to {self.save_path}")
+        model.save(path)
+        normalizer = model.get_vec_normalize_env()
+        if normalizer is not None:
+            normalizer.save(os.path.join(self.params_path, "vecnormalize.pkl"))
+            save_statistics(normalizer, statistics_path(path))
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        """Write config.yml, args.yml and command.txt as plain data."""
+        folder = Path(self.params_path)
+        write_whole(folder / "config.yml", yaml.safe_dump(saved_hyperparams))
+        write_whole(folder / "args.yml", yaml.safe_dump(vars(self.args)))
+        write_whole(folder / "command.txt", shlex.join(self.command) + "\n")
+        if self.verbose > 0:
+            print(f"Log path: {self.save_path}")
+
+
+class _SaveStatistics(BaseCallback):
+    """Write the statistics of ``normalize:``, if any, each time it is called.
+
+    :param path: Where
+    """
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path = path
+
+    def _on_step(self) -> bool:
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None:
+            save_statistics(normalizer, self.path)
+        return True
+
+
+class _Checkpoint(CheckpointCallback):
+    """Checkpoints, each with its own plain statistics of ``normalize:``."""
+
+    def _on_step(self) -> bool:
+        super()._on_step()
+        normalizer = self.model.get_vec_normalize_env()
+        if self.n_calls % self.save_freq == 0 and normalizer is not None:
+            save_statistics(normalizer, statistics_path(self._checkpoint_path(extension="zip")))
+        return True

@@ -1,0 +1,263 @@
+"""Hyperparameters of a run: read the YAML files, merge them, refuse what no one would read.
+
+A run's configuration is defaults.yml, then the task's entry of envs.yml, the method's of algos.yml,
+the presets, a ``--conf-file`` and ``-params``; later ones win and mappings merge. It has the
+arguments of the algorithm's constructor, and ``ZOO_KEYS``. YAML is data: nothing in it is executed.
+"""
+
+import inspect
+import math
+import re
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_e2c import E2CMAPPO, MAPPO
+from sb3_e2c.envs import ENV_IDS
+from sb3_e2c.zoo.console import UserError, unknown
+
+ALGORITHMS: dict[str, type[MAPPO]] = {
+    "mappo": MAPPO,
+    "c_mappo": MAPPO,
+    "c_mappo_pe": MAPPO,
+    "e2c": E2CMAPPO,
+    "e2c_t": E2CMAPPO,
+}
+ZOO_KEYS = ("n_envs", "n_timesteps", "env_kwargs", "normalize", "callback")
+FLAGS = ("env", "seed", "device", "verbose", "tensorboard_log")
+FOLDER = Path(__file__).parent / "hyperparams"
+
+# Naming another class drops the arguments of the old one.
+_OWN_ARGUMENTS = {"estimator": "estimator_kwargs", "multipliers_class": "multipliers_kwargs"}
+_COUNT, _SHARE, _AMOUNT = (1, math.inf), (0, 1), (0, math.inf)
+_BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("n_envs", "n_timesteps", "n_steps", "batch_size", "n_epochs"), _COUNT),
+    **dict.fromkeys(("gamma", "gae_lambda", "cost_gamma"), _SHARE),
+    **dict.fromkeys(("learning_rate", "critic_learning_rate", "clip_range"), _AMOUNT),
+    **dict.fromkeys(("ent_coef", "vf_coef", "max_grad_norm", "target_kl"), _AMOUNT),
+    **dict.fromkeys(("cost_limits", "reward_scale", "stats_window_size"), _AMOUNT),
+}
+_ZOO_TYPES: dict[str, Any] = {
+    "n_envs": int,
+    "n_timesteps": int,
+    "env_kwargs": dict | None,
+    "normalize": bool | dict,
+    "callback": str | list | dict | None,
+}
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which 3e-4 is a number; YAML 1.1 takes it for a string."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Read a mapping from a YAML file, as data only.
+
+    :param path: The file
+    :raises UserError: if there is no such file, or something else in it
+    """
+    try:
+        content = yaml.load(Path(path).read_text(), Loader=_Loader)  # a SafeLoader
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"cannot read {path}: {error}") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds {type(content).__name__}, expected a YAML mapping")
+    return content
+
+
+def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested mappings, later ones over earlier ones.
+
+    Naming another class (``estimator``, ``multipliers_class``) drops the arguments of the old one
+    (``estimator_kwargs``, ``multipliers_kwargs``).
+
+    :param layers: The mappings; none of them is changed
+    """
+    result: dict[str, Any] = {}
+    for layer in layers:
+        for key, arguments in _OWN_ARGUMENTS.items():
+            if key in layer and result.get(key) not in (None, layer[key]):
+                result.pop(arguments, None)
+        for key, value in layer.items():
+            if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
+                result[key] = merge(result[key], value)
+            else:
+                result[key] = deepcopy(value)
+    return result
+
+
+def check_algo(algo: str) -> None:
+    """Raise :class:`UserError` for an algorithm that the zoo does not know."""
+    if algo not in ALGORITHMS:
+        raise unknown("algorithm (--algo)", algo, ALGORITHMS)
+
+
+def check_env(env_id: str) -> None:
+    """Raise :class:`UserError` for an environment that the zoo does not know."""
+    if env_id not in ENV_IDS:
+        raise unknown("environment (--env)", env_id, ENV_IDS)
+
+
+def preset_names() -> list[str]:
+    """Names in presets.yml."""
+    return list(read_yaml(FOLDER / "presets.yml"))
+
+
+def parse_presets(text: str) -> list[str]:
+    """Names in a comma-separated list.
+
+    :param text: For instance ``pure,lambda_1``
+    :raises UserError: for a name that presets.yml does not have
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in preset_names():
+            raise unknown("preset (--preset)", name, preset_names())
+    return names
+
+
+def task_entry(env_id: str) -> dict[str, Any]:
+    """The task's entry of envs.yml over the one it names as its base; empty if it has none.
+
+    :param env_id: A key of ``ENV_IDS``
+    """
+    table = read_yaml(FOLDER / "envs.yml")
+    entry = dict(table.get(env_id, {}))
+    base = entry.pop("base", None)
+    return merge(table[base] if base else {}, entry)
+
+
+def team_limits(env_id: str, config: Mapping[str, Any]) -> list[float]:
+    """Limits on the team's costs in a configuration; of a method without any, the task's.
+
+    :param env_id: A key of ``ENV_IDS``
+    :param config: See :func:`resolve`
+    """
+    limits = config.get("cost_limits")
+    if limits is None:
+        limits = task_entry(env_id).get("cost_limits")
+    if limits is None:
+        return []
+    return [float(limit) for limit in (limits if isinstance(limits, list) else [limits])]
+
+
+def resolve(
+    algo: str,
+    env_id: str,
+    presets: Iterable[str] = (),
+    overrides: Mapping[str, Any] | None = None,
+    base: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The configuration of a run, checked.
+
+    :param algo: A key of ``ALGORITHMS``
+    :param env_id: A key of ``ENV_IDS``
+    :param presets: Names in presets.yml, applied in this order
+    :param overrides: What the user asked for
+    :param base: Start from this instead of the shipped files, to continue a run
+    :raises UserError: for unknown names and keys, and values of a wrong type or range
+    """
+    check_algo(algo)
+    check_env(env_id)
+    known = read_yaml(FOLDER / "presets.yml")
+    methods = read_yaml(FOLDER / "algos.yml")
+    defaults = read_yaml(FOLDER / "defaults.yml")
+    start = [base] if base is not None else [defaults, task_entry(env_id), methods[algo]]
+    shipped = merge(*start, *(known[name] for name in presets))
+    # Files for all methods may hold what only some take (oem_kwargs); a user's key must be read.
+    config = merge({key: shipped[key] for key in shipped if key in keys(algo)}, overrides or {})
+    check(algo, config)
+    return dict(sorted(config.items()))
+
+
+def keys(algo: str) -> dict[str, Any]:
+    """Everything that a configuration may hold, with its type.
+
+    :param algo: A key of ``ALGORITHMS``
+    """
+    arguments = _constructor_types(ALGORITHMS[algo])
+    no_numbers = (*FLAGS, "_init_setup_model")
+    return {key: arguments[key] for key in arguments if key not in no_numbers} | _ZOO_TYPES
+
+
+def check(algo: str, config: Mapping[str, Any]) -> None:
+    """Raise :class:`UserError` for unknown keys, and values of a wrong type or range.
+
+    :param algo: A key of ``ALGORITHMS``
+    :param config: The configuration
+    """
+    types_of = keys(algo)
+    for key, value in config.items():
+        if key in FLAGS:
+            raise UserError(f"{key} is no hyperparameter; use the flag --{key.replace('_', '-')}")
+        if key not in types_of:
+            raise unknown(f"hyperparameter for {algo}", key, types_of)
+        if not _has_type(value, types_of[key]):
+            expected = getattr(types_of[key], "__name__", str(types_of[key]))
+            raise UserError(f"{key} is {value!r}; expected {expected}")
+        _check_bounds(key, value)
+    for key in ("policy", "n_envs", "n_timesteps", "n_steps"):
+        if key not in config:
+            raise UserError(
+                f"{key} is missing for this environment; give it with -params {key}:..."
+            )
+
+
+def _check_bounds(key: str, value: Any) -> None:
+    low, high = _BOUNDS.get(key, (-math.inf, math.inf))
+    for number in value if isinstance(value, list) else [value]:
+        if isinstance(number, int | float) and not low <= number <= high:
+            limit = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            raise UserError(f"{key} is {value!r}; expected {limit}")
+
+
+def _constructor_types(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """Arguments of a constructor, with those that it passes on to its base class."""
+    arguments: dict[str, Any] = {}
+    for each in algorithm.__mro__:
+        constructor = vars(each).get("__init__")
+        if constructor is None:
+            continue
+        parameters = inspect.signature(constructor).parameters.values()
+        hints = typing.get_type_hints(constructor)
+        named = [
+            p for p in parameters if p.kind == p.POSITIONAL_OR_KEYWORD or p.kind == p.KEYWORD_ONLY
+        ]
+        for parameter in named:
+            arguments.setdefault(parameter.name, hints.get(parameter.name, Any))
+        if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    del arguments["self"]
+    return arguments
+
+
+def _has_type(value: Any, expected: Any) -> bool:
+    """Whether a value from YAML can stand for an argument of this type."""
+    origin, options = typing.get_origin(expected), typing.get_args(expected)
+    if origin in (typing.Union, types.UnionType):
+        return any(_has_type(value, option) for option in options)
+    if origin is typing.Literal:
+        return value in options
+    if origin is type or expected is Any:  # classes are given by name, see build.py
+        return expected is Any or isinstance(value, str)
+    kind = origin or expected
+    if kind in (float, int) and isinstance(value, bool):
+        return False
+    if kind is float:
+        return isinstance(value, int | float) and math.isfinite(value)
+    if kind is Sequence:
+        return isinstance(value, list) and all(_has_type(each, options[0]) for each in value)
+    if kind is not None and "Callable" in str(kind):  # a schedule
+        return isinstance(value, str) and re.fullmatch(r"lin_[\d.eE+-]+", value) is not None
+    return isinstance(value, type(None) if kind is None else kind)

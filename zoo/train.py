@@ -1,0 +1,194 @@
+"""Train a team: ``python -m sb3_e2c.zoo.train --algo e2c_t --env MultiRover-6-3-v0``.
+
+RL-Zoo's ``train`` with our algorithms, environments and manager, one more flag (``--preset``), and
+mistakes reported in one line before anything is written. All steps are agent steps; ``n_envs`` in
+the hyperparameters counts worlds.
+"""
+
+import argparse
+import contextlib
+import importlib
+import importlib.util
+import sys
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import rl_zoo3.train
+
+from sb3_e2c.zoo.console import (
+    ConsoleParser,
+    StoreDict,
+    UserError,
+    check_device,
+    check_writable,
+    one_line_errors,
+)
+from sb3_e2c.zoo.experiment import TeamExperimentManager, configuration, register
+from sb3_e2c.zoo.hyperparams import (
+    ALGORITHMS,
+    check_algo,
+    check_env,
+    parse_presets,
+    preset_names,
+)
+
+_PAIRS = {"action": StoreDict, "metavar": "KEY:VALUE"}
+# RL-Zoo's flags that mean something else here, or read their values as data instead of code
+_CHANGED_FLAGS: dict[str, dict[str, Any]] = {
+    "--algo": {
+        "default": "e2c_t",
+        "choices": None,
+        "metavar": "ALGO",
+        "help": f"{', '.join(ALGORITHMS)} (default: e2c_t)",
+    },
+    "--env": {"default": "MultiRover-6-3-v0", "help": "environment ID (see sb3_e2c.envs.ENV_IDS)"},
+    "--num-threads": {  # small networks: one thread is faster, and results do not depend on cores
+        "default": 1,
+        "help": "Number of threads for PyTorch (default: 1; -1: PyTorch's own choice)",
+    },
+    "--vec-env": {"help": "subproc: worlds run in worker processes (SuperSuit), else in this one"},
+    "--eval-freq": {"help": "Evaluate the team every n agent steps (if negative, no evaluation)"},
+    "--save-freq": {"help": "Save the team every n agent steps (if negative, no checkpoint)"},
+    "--eval-episodes": {"help": "Number of world episodes to use for evaluation"},
+    "--n-eval-envs": {"help": "Number of worlds for evaluation"},
+    "--trained-agent": {"help": "Continue training this .zip (of your own: it is unpickled)"},
+    "--conf-file": {"help": "YAML file of hyperparameters, by environment ID or 'default'"},
+    "--hyperparams": {
+        **_PAIRS,
+        "help": "Overwrite hyperparameters (e.g. n_epochs:4 oem_kwargs.psi:0.1)",
+    },
+    "--env-kwargs": _PAIRS,
+    "--eval-env-kwargs": _PAIRS,
+}
+_AT_LEAST = {
+    "eval_episodes": 1,
+    "n_eval_envs": 1,
+    "log_interval": -2,
+    "verbose": 0,
+}
+
+
+class TrainParser(ConsoleParser):
+    """The parser that RL-Zoo's ``train`` fills, with our flags and checks.
+
+    :param argv: The command line after the program's name
+    """
+
+    def __init__(self, argv: Sequence[str]):
+        super().__init__(prog="sb3-e2c train", description=__doc__, formatter_class=_Raw)
+        self.argv = argv
+
+    def add_argument(self, *names: str, **kwargs: Any) -> Any:
+        """Add a flag of RL-Zoo's, changed where ours differ."""
+        for name in names:
+            kwargs.update(_CHANGED_FLAGS.get(name, {}))
+        return super().add_argument(*names, **kwargs)
+
+    def parse_args(self, *_: Any, **__: Any) -> Any:
+        """Parse and check the command line; exits with status 2 and one line on a mistake."""
+        self.add_argument(
+            "--preset",
+            default="headline",
+            metavar="NAME,NAME",
+            help=f"Named overrides, to be combined: {', '.join(preset_names())}",
+        )
+        args = super().parse_args(self.argv)
+        with one_line_errors():
+            _check(args)
+        return args
+
+
+class _Raw(argparse.RawDescriptionHelpFormatter):
+    """Keeps the paragraphs of the description."""
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse what cannot be meant, before anything is built or written."""
+    _import_packages(args.gym_packages)
+    register()
+    check_algo(args.algo)
+    check_env(args.env)
+    parse_presets(args.preset)
+    _check_numbers(args)
+    if args.optimize_hyperparameters:
+        raise UserError("-optimize: the search for hyperparameters is not available for teams")
+    check_device(args.device)
+    if args.track and importlib.util.find_spec("wandb") is None:
+        raise UserError("--track needs Weights & Biases: pip install wandb")
+    check_writable(args.log_folder, "--log-folder")
+    if args.tensorboard_log:
+        check_writable(args.tensorboard_log, "--tensorboard-log")
+    if args.trained_agent and not zipfile.is_zipfile(args.trained_agent):
+        raise UserError(f"-i {args.trained_agent}: expected the .zip file of a saved model")
+    configuration(args)
+
+
+def _import_packages(names: Sequence[str]) -> None:
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UserError(f"--gym-packages {name}: {error}") from error
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    for name, least in _AT_LEAST.items():
+        if getattr(args, name) < least:
+            flag = f"--{name.replace('_', '-')}"
+            raise UserError(f"{flag} is {getattr(args, name)}; expected at least {least}")
+    if args.n_timesteps != -1 and args.n_timesteps < 1:
+        raise UserError(f"--n-timesteps is {args.n_timesteps}; expected at least 1")
+    if args.seed >= 2**32:
+        raise UserError(f"--seed is {args.seed}; expected less than 2**32")
+    if args.log_interval == 0:
+        raise UserError("--log-interval is 0; expected at least 1 (or -1: default, -2: none)")
+
+
+@contextlib.contextmanager
+def _our_zoo(argv: Sequence[str]) -> Iterator[list[TeamExperimentManager]]:
+    """RL-Zoo's train module with our parser and manager; yields the managers that it makes."""
+    managers: list[TeamExperimentManager] = []
+    command = ["python", "-m", "sb3_e2c.zoo.train", *argv]
+
+    def make_manager(*args: Any, **kwargs: Any) -> TeamExperimentManager:
+        managers.append(TeamExperimentManager(*args, command=command, **kwargs))
+        return managers[-1]
+
+    ours = {
+        "argparse": SimpleNamespace(ArgumentParser=lambda: TrainParser(argv)),
+        "ExperimentManager": make_manager,
+    }
+    stock = {name: getattr(rl_zoo3.train, name) for name in ours}
+    vars(rl_zoo3.train).update(ours)
+    try:
+        yield managers
+    finally:
+        vars(rl_zoo3.train).update(stock)
+
+
+def train(argv: Sequence[str]) -> Path:
+    """Train as a command line asks.
+
+    :param argv: Flags, as after ``sb3-e2c train``
+    :return: The folder of the run
+    :raises UserError: for mistakes that only show when the run is built
+    """
+    with _our_zoo(argv) as managers:
+        rl_zoo3.train.train()
+    return Path(managers[-1].save_path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Console command ``sb3-e2c train``.
+
+    :param argv: Flags; default: those of this process
+    """
+    with one_line_errors():
+        train(sys.argv[1:] if argv is None else argv)
+
+
+if __name__ == "__main__":
+    main()
