@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import (
@@ -182,7 +183,8 @@ class TeamEvalCallback(EvalCallback):
     The best model is, among evaluations whose mean costs keep all limits, the one with the
     highest mean return; as long as there is none, the one that exceeds them least. Thus
     ``best_mean_reward`` may fall when the first safe model is found. ``evaluations.npz`` has
-    SB3's keys and ``costs``, shape (evaluations, E, M).
+    SB3's keys and ``costs``, shape (evaluations, E, M). Evaluating changes nothing in the training,
+    also with sampled actions.
 
     :param eval_env: made by ``share_parameters``, perhaps wrapped
     :param cost_limits: limits on the team's costs of an episode, shape (M,); None takes those of
@@ -234,14 +236,15 @@ class TeamEvalCallback(EvalCallback):
                     "wrap both in VecNormalize, in the same place"
                 ) from error
         self._is_success_buffer = []
-        return evaluate_team(
-            self.model,
-            self.eval_env,
-            n_episodes=self.n_eval_episodes,
-            deterministic=self.deterministic,
-            render=self.render,
-            callback=self._log_success_callback,
-        )
+        with th.random.fork_rng():  # sampling here leaves the random numbers of the training alone
+            return evaluate_team(
+                self.model,
+                self.eval_env,
+                n_episodes=self.n_eval_episodes,
+                deterministic=self.deterministic,
+                render=self.render,
+                callback=self._log_success_callback,
+            )
 
     def _save(self, evaluation: TeamEvaluation) -> None:
         self.evaluations_timesteps.append(self.num_timesteps)

@@ -305,3 +305,12 @@ class TestCallback:
         with pytest.warns(UserWarning, match="not of the same type"):
             ppo(VecNormalize(worlds())).learn(16, callback=callback)
         assert callback.last_mean_reward == -np.inf
+
+    def test_evaluating_changes_nothing_in_the_training(self):
+        learned = []
+        for evaluate in (False, True):
+            model = ppo(worlds())
+            evaluation = TeamEvalCallback(worlds(), eval_freq=4, deterministic=False, verbose=0)
+            model.learn(96, callback=evaluation if evaluate else None)
+            learned.append(np.concatenate([p.detach().ravel() for p in model.policy.parameters()]))
+        assert np.array_equal(*learned)
