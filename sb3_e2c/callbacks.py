@@ -1,4 +1,4 @@
-"""Observation-entropy rewards for any on-policy algorithm (Algorithm 1, Alg. 2 line 10)."""
+"""Observation-entropy rewards for any on-policy algorithm (Alg. 1 l. 11-17, Alg. 2 l. 10)."""
 
 import math
 from collections.abc import Sequence
@@ -157,7 +157,7 @@ def _editable_rewards(variables: dict[str, Any]) -> np.ndarray:
 
 
 def _relevance(infos: Sequence[dict[str, Any]]) -> np.ndarray:
-    """Factor beta(o) of each slot, 1 where it is missing, None or 0 (Alg. 1 lines 11-13).
+    """Factor beta(o) of each slot, 1 where it is missing, None or 0 (Alg. 1 l. 11-13).
 
     :param infos: one per slot
     :return: shape (S,)

@@ -1,4 +1,4 @@
-"""Observation-entropy bonuses (Algorithm 1 lines 3-10): visit counts and nearest neighbors.
+"""Observation-entropy bonuses (Alg. 1 l. 3-10): visit counts and nearest neighbors.
 
 An estimator keeps one memory per slot, the paper's ``b^i``: what this agent has observed since its
 episode began. An observation is scored against that memory and stored afterwards, so it is never
@@ -25,7 +25,7 @@ class EntropyEstimator(Protocol):
         """
 
     def score(self, observations: np.ndarray) -> np.ndarray:
-        """Bonus of one new observation per slot, which is then stored (Alg. 1 lines 3-10).
+        """Bonus of one new observation per slot, which is then stored (Alg. 1 l. 3-10).
 
         :param observations: o_{t+1}, shape (S, D)
         :return: bonus before ``beta`` and ``psi``, shape (S,)
@@ -39,7 +39,7 @@ class EntropyEstimator(Protocol):
 
 
 class VisitCount:
-    """Bonus 1 / n: n visits to this quantized observation in this episode (Alg. 1 lines 4-5).
+    """Bonus 1 / n: n visits to this quantized observation in this episode (Alg. 1 l. 4-5).
 
     The paper counts before it stores, hence 1 / 0 at a first visit; here the count includes the
     present visit, so that first visits earn 1 and second ones 1/2.
@@ -77,7 +77,7 @@ class VisitCount:
         """See :meth:`EntropyEstimator.score`."""
         codes = self.quantize(observations)
         self._memory.prepare(codes)
-        return 1.0 / _count_visits(codes, self._memory.rows, self._memory.filled)
+        return 1.0 / _count_visits(codes, self._memory.columns, self._memory.filled)
 
     def forget(self, slots: np.ndarray) -> None:
         """See :meth:`EntropyEstimator.forget`."""
@@ -98,7 +98,7 @@ class VisitCount:
 
 
 class NearestNeighbor:
-    """Bonus log(D_k + 1): distance to the k-th nearest earlier observation (Alg. 1 lines 7-8).
+    """Bonus log(D_k + 1): distance to the k-th nearest earlier observation (Alg. 1 l. 7-8).
 
     Distances are Euclidean, among the observations of this slot's running episode. While fewer
     than k are stored, the farthest of them counts; without any, the bonus is 0.
@@ -118,7 +118,7 @@ class NearestNeighbor:
         """See :meth:`EntropyEstimator.score`."""
         observations = np.ascontiguousarray(observations, dtype=np.float32)
         self._memory.prepare(observations)
-        distances = _kth_distances(observations, self._memory.rows, self._memory.filled, self.k)
+        distances = _kth_distances(observations, self._memory.columns, self._memory.filled, self.k)
         return np.log1p(distances)
 
     def forget(self, slots: np.ndarray) -> None:
@@ -127,26 +127,28 @@ class NearestNeighbor:
 
 
 class _EpisodeMemory:
-    """One growing list of rows per slot, in one array so that a kernel can handle all slots.
+    """One growing list of observations per slot, in one array so that a kernel handles all slots.
 
-    ``rows`` (S, capacity, D) and ``filled`` (S,): slot s holds ``rows[s, : filled[s]]``.
+    ``columns`` (S, D, capacity) and ``filled`` (S,): the n-th observation of slot s is
+    ``columns[s, :, n]``. The observations lie along the last axis, where the kernels' inner loops
+    run: they are long, and compile to vector instructions for any D.
     """
 
     def __init__(self, dtype: type[np.generic]) -> None:
         self.dtype = dtype
-        self.rows = np.zeros((0, 0, 0), dtype)
+        self.columns = np.zeros((0, 0, 0), dtype)
         self.filled = np.zeros(0, np.int64)
 
     def reset(self, n_slots: int) -> None:
-        self.rows = np.zeros((_positive_integer("n_slots", n_slots), 0, 0), self.dtype)
+        self.columns = np.zeros((_positive_integer("n_slots", n_slots), 0, 0), self.dtype)
         self.filled = np.zeros(n_slots, np.int64)
 
     def prepare(self, new: np.ndarray) -> None:
-        """Check a batch and make room for one more row in every slot.
+        """Check a batch and make room for one more observation in every slot.
 
-        :param new: the rows to come, shape (S, D)
+        :param new: what is to come, shape (S, D)
         """
-        n_slots, capacity, size = self.rows.shape
+        n_slots, size, capacity = self.columns.shape
         if n_slots == 0:
             raise ValueError("The estimator has no slots yet: call reset(n_slots) before score().")
         if new.ndim != 2 or len(new) != n_slots or new.shape[1] == 0:
@@ -160,106 +162,107 @@ class _EpisodeMemory:
                 "when the observations change."
             )
         if self.filled.max() >= capacity:
-            rows = np.zeros((n_slots, max(64, 2 * capacity), new.shape[1]), self.dtype)
-            rows[:, :capacity, :size] = self.rows
-            self.rows = rows
+            columns = np.zeros((n_slots, new.shape[1], max(64, 2 * capacity)), self.dtype)
+            columns[:, :size, :capacity] = self.columns
+            self.columns = columns
 
     def forget(self, slots: np.ndarray) -> None:
         self.filled[np.asarray(slots, dtype=bool)] = 0
 
 
 @njit(cache=True)
-def _count_visits(codes: np.ndarray, rows: np.ndarray, filled: np.ndarray) -> np.ndarray:
-    """Count the visits to each slot's code, this one included; then store it (lines 4, 10).
+def _count_visits(codes: np.ndarray, columns: np.ndarray, filled: np.ndarray) -> np.ndarray:
+    """Count the visits to each slot's code, this one included; then store it (Alg. 1 l. 4, 10).
 
     :param codes: quantized observations, shape (S, D)
-    :param rows: earlier codes, shape (S, capacity, D)
+    :param columns: earlier codes, shape (S, D, capacity)
     :param filled: number of them, shape (S,)
     :return: visits, at least 1, shape (S,)
     """
     visits = np.ones(len(codes), np.int64)
+    differing_bits = np.empty(columns.shape[2], columns.dtype)
     for slot in range(len(codes)):
         n = filled[slot]
-        visits[slot] += _occurrences(codes[slot], rows[slot, :n])
-        rows[slot, n] = codes[slot]
+        differing_bits[:n] = 0
+        for d in range(codes.shape[1]):
+            code, earlier = codes[slot, d], columns[slot, d]
+            for i in range(n):
+                differing_bits[i] |= earlier[i] ^ code
+            earlier[n] = code
+        for i in range(n):
+            visits[slot] += differing_bits[i] == 0
         filled[slot] += 1
     return visits
 
 
 @njit(cache=True)
-def _occurrences(code: np.ndarray, rows: np.ndarray) -> int:
-    count = 0
-    for row in range(len(rows)):
-        if _differing_bits(code, rows[row]) == 0:
-            count += 1
-    return count
-
-
-# The two innermost loops have no early exit on purpose: a loop of known length compiles to vector
-# instructions, which is several times faster at the usual 8 to 100 numbers.
-@njit(cache=True)
-def _differing_bits(a: np.ndarray, b: np.ndarray) -> int:
-    bits = 0
-    for i in range(len(a)):
-        bits |= a[i] ^ b[i]
-    return bits
-
-
-@njit(cache=True)
 def _kth_distances(
-    observations: np.ndarray, rows: np.ndarray, filled: np.ndarray, k: int
+    observations: np.ndarray, columns: np.ndarray, filled: np.ndarray, k: int
 ) -> np.ndarray:
-    """Distance of each slot's observation to its k-th neighbor; then store it (lines 7, 10).
+    """Distance of each slot's observation to its k-th neighbor; then store it (Alg. 1 l. 7, 10).
 
     :param observations: o_{t+1}, shape (S, D)
-    :param rows: earlier observations, shape (S, capacity, D)
+    :param columns: earlier observations, shape (S, D, capacity)
     :param filled: number of them, shape (S,)
     :param k: which neighbor; the farthest one where there are fewer
     :return: distances, 0 without neighbors, shape (S,)
     """
     distances = np.zeros(len(observations))
-    nearest = np.empty(min(k, rows.shape[1]), np.float32)
+    squared = np.empty(columns.shape[2], np.float32)
+    nearest = np.empty(min(k, columns.shape[2]), np.float32)
     for slot in range(len(observations)):
         n = filled[slot]
         if n > 0:
-            squared = _kth_squared_distance(observations[slot], rows[slot, :n], nearest)
-            distances[slot] = np.sqrt(np.float64(squared))
-        rows[slot, n] = observations[slot]
+            _squared_distances(observations[slot], columns[slot], squared[:n])
+            distances[slot] = np.sqrt(np.float64(_kth_smallest(squared[:n], nearest)))
+        columns[slot, :, n] = observations[slot]
         filled[slot] += 1
     return distances
 
 
 @njit(cache=True)
-def _kth_squared_distance(query: np.ndarray, rows: np.ndarray, nearest: np.ndarray) -> np.float32:
-    """Squared distance of the ``len(nearest)``-th nearest row, or of the farthest if fewer.
+def _squared_distances(query: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
+    """Squared distances of the first n observations, four numbers of each at a time.
+
+    Differences come before squares, so near duplicates keep their relative precision, unlike with
+    |a|^2 - 2ab + |b|^2.
 
     :param query: shape (D,)
-    :param rows: shape (n, D), n >= 1
-    :param nearest: work space, kept in ascending order
+    :param columns: shape (D, capacity)
+    :param squared: the result, shape (n,)
     """
-    k = min(len(nearest), len(rows))
-    nearest[:k] = np.inf
+    squared[:] = 0.0
+    whole = len(query) - len(query) % 4
+    for d in range(0, whole, 4):
+        a, b, c, e = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
+        qa, qb, qc, qe = query[d], query[d + 1], query[d + 2], query[d + 3]
+        for i in range(len(squared)):
+            ab = (a[i] - qa) * (a[i] - qa) + (b[i] - qb) * (b[i] - qb)
+            squared[i] += ab + ((c[i] - qc) * (c[i] - qc) + (e[i] - qe) * (e[i] - qe))
+    for d in range(whole, len(query)):
+        a, qa = columns[d], query[d]
+        for i in range(len(squared)):
+            squared[i] += (a[i] - qa) * (a[i] - qa)
+
+
+@njit(cache=True)
+def _kth_smallest(numbers: np.ndarray, smallest: np.ndarray) -> np.float32:
+    """The ``len(smallest)``-th smallest number, or the largest if there are fewer.
+
+    :param numbers: shape (n,), n >= 1
+    :param smallest: work space, kept in ascending order
+    """
+    k = min(len(smallest), len(numbers))
+    smallest[:k] = np.inf
     # latest first: they are the closest in a trajectory, so later ones are seldom inserted
-    for row in range(len(rows) - 1, -1, -1):
-        distance = _squared_distance(query, rows[row])
+    for i in range(len(numbers) - 1, -1, -1):
         place = k - 1
-        if distance < nearest[place]:
-            while place > 0 and nearest[place - 1] > distance:
-                nearest[place] = nearest[place - 1]
+        if numbers[i] < smallest[place]:
+            while place > 0 and smallest[place - 1] > numbers[i]:
+                smallest[place] = smallest[place - 1]
                 place -= 1
-            nearest[place] = distance
-    return nearest[k - 1]
-
-
-# "reassoc" allows the sum to be split over vector lanes. Differences come before squares, so near
-# duplicates keep their relative precision, unlike with |a|^2 - 2ab + |b|^2.
-@njit(cache=True, fastmath={"reassoc", "contract"})
-def _squared_distance(a: np.ndarray, b: np.ndarray) -> np.float32:
-    total = np.float32(0.0)
-    for i in range(len(a)):
-        difference = a[i] - b[i]
-        total += difference * difference
-    return total
+            smallest[place] = numbers[i]
+    return smallest[k - 1]
 
 
 def _positive_integer(name: str, value: Any) -> int:
