@@ -1,7 +1,7 @@
 """Networks with a memory: a GRU in the actor and in all critics ("GruPolicy" of MAPPO, Sec. 5.2).
 
-Each network is its MLP, then a GRU, then its output layer. Whole sequences are trained with one
-fused call per network and no Python loop over time.
+Each network is its MLP, then a GRU, then its output layer. Whole sequences are trained, without
+padding (see ``sequences.py``, ``gru.py``).
 """
 
 from typing import Any
@@ -10,8 +10,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from torch import nn
-from torch.nn.utils.rnn import PackedSequence
 
+from sb3_e2c.gru import run_sequences, run_step
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.sequences import Memory, Sequences
 
@@ -106,7 +106,7 @@ class GruPolicy(TeamPolicy):
         features = super(TeamPolicy, self).extract_features(obs)
         features = features[0] if isinstance(features, tuple) else features
         hidden = self.mlp_extractor.forward_actor(features)
-        states = self.actor_gru(hidden[None], states[None])[0][0]
+        states = run_step(self.actor_gru, hidden, states)
         return self._get_action_dist_from_latent(states), states
 
     def get_distribution(self, obs: Any) -> Distribution:
@@ -158,7 +158,7 @@ class GruPolicy(TeamPolicy):
 def _run(
     gru: nn.GRU, inputs: th.Tensor, batch_sizes: th.Tensor | None, initial: th.Tensor | None
 ) -> th.Tensor:
-    """Hidden states after every step of sequences, in one fused call.
+    """Hidden states after every step of sequences.
 
     :param gru: The layer
     :param inputs: Steps in the order of ``PackedSequence``, shape (B, F)
@@ -167,9 +167,5 @@ def _run(
     :return: Shape (B, H)
     """
     if batch_sizes is None or initial is None:
-        return gru(inputs[None])[0][0]
-    states = initial.flatten(0, 1)[None]
-    if batch_sizes[0] == batch_sizes[-1]:  # all of one length: a plain block of numbers
-        blocks = inputs.view(len(batch_sizes), -1, inputs.shape[-1])
-        return gru(blocks, states)[0].flatten(0, 1)
-    return gru(PackedSequence(inputs, batch_sizes), states)[0].data
+        return run_step(gru, inputs, inputs.new_zeros(len(inputs), gru.hidden_size))
+    return run_sequences(gru, inputs, batch_sizes, initial.flatten(0, 1))
