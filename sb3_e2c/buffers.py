@@ -13,8 +13,16 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_e2c.losses import penalized_advantages
-from sb3_e2c.policies import TeamPolicy
+from sb3_e2c.policies import StepEvaluation, TeamPolicy
 from sb3_e2c.returns import gae
+from sb3_e2c.sequences import (
+    Memory,
+    Sequences,
+    cut_at_ends,
+    initial_memory,
+    packed_rows,
+    random_groups,
+)
 
 
 class TeamSamples(NamedTuple):
@@ -70,6 +78,7 @@ class TeamRolloutBuffer(RolloutBuffer):
     ):
         self.n_agents, self.n_worlds = n_agents, n_envs // n_agents
         self.party_shape = (n_parties, n_constraints)
+        self.initial: Memory | None = None
         self.critic_state_dim = critic_state_dim
         self.cost_gamma = cost_gamma
         super().__init__(
@@ -93,10 +102,14 @@ class TeamRolloutBuffer(RolloutBuffer):
         self.dones = np.zeros(worlds, bool)
         self.episode_starts = np.zeros(slots, np.float32)
 
-    def reset(self) -> None:
-        """Forget the last rollout; the arrays stay and are overwritten."""
+    def reset(self, initial: Memory | None = None) -> None:
+        """Forget the last rollout; the arrays stay and are overwritten.
+
+        :param initial: Hidden states of all worlds before the next rollout
+        """
         self.pos, self.full = 0, False
         self.timeouts: list[Timeout] = []
+        self.initial = initial
 
     def add(  # type: ignore[override]
         self,
@@ -134,22 +147,42 @@ class TeamRolloutBuffer(RolloutBuffer):
 
     def finish(
         self, policy: TeamPolicy, last_obs: np.ndarray, last_critic_states: np.ndarray
-    ) -> None:
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Evaluate the networks on the rollout and compute all advantages (Alg. 2 l. 12).
 
         :param policy: The networks that collected the rollout
         :param last_obs: Observations after the last step, shape (S, D)
         :param last_critic_states: Extra state of the critics there, shape (W, G)
+        :return: Hidden states of the critics after the last step, shapes (W, 1, H) and (W, K, H)
         """
         with th.no_grad():
-            evaluation = policy.evaluate_steps(*self._network_inputs())
+            evaluation = self._evaluate(policy)
             values, cost_values = policy.denormalize(evaluation.values, evaluation.cost_values)
-            self._bootstrap_timeouts(policy)
-            last_values, last_cost_values = self._values(policy, last_obs, last_critic_states)
+            latents = (evaluation.value_latent, evaluation.cost_latent)
+            self._bootstrap_timeouts(policy, latents)
+            final = tuple(latent[-self.n_worlds :] for latent in latents)
+            last = self._values(policy, last_obs, last_critic_states, final)
         self.log_probs[:] = evaluation.log_prob.cpu().numpy().reshape(self.log_probs.shape)
         self.values[:] = values.cpu().numpy().reshape(self.values.shape)
         self.cost_values[:] = cost_values.cpu().numpy().reshape(self.cost_values.shape)
-        self.compute_returns_and_advantage(last_values, last_cost_values)
+        self.compute_returns_and_advantage(*last)
+        return final[0], final[1]
+
+    def _evaluate(self, policy: TeamPolicy) -> StepEvaluation:
+        """Evaluate all networks on the whole rollout, in the order of its rows (T·W)."""
+        inputs = self._network_inputs()
+        if not policy.recurrent:
+            return policy.evaluate_steps(*inputs)
+        assert self.initial is not None, "a recurrent rollout needs its initial hidden states"
+        cut = cut_at_ends(self.dones)
+        indices, batch_sizes = packed_rows(cut, self.n_worlds)
+        rows = th.from_numpy(indices).to(self.device)
+        sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(cut, self.initial))
+        observations, actions, critic_states = (each[rows] for each in inputs)
+        packed = policy.evaluate_steps(observations, actions, critic_states, sequences)
+        back = th.empty_like(rows)
+        back[rows] = th.arange(len(rows), device=self.device)
+        return StepEvaluation(*(each[back] for each in packed))
 
     def compute_returns_and_advantage(  # type: ignore[override]
         self, last_values: np.ndarray, last_cost_values: np.ndarray
@@ -175,19 +208,40 @@ class TeamRolloutBuffer(RolloutBuffer):
         )
         self.cost_returns[:] = self.cost_advantages + self.cost_values
 
-    def _bootstrap_timeouts(self, policy: TeamPolicy) -> None:
-        """A time limit is no end: add the discounted value of what would have followed."""
+    def _bootstrap_timeouts(self, policy: TeamPolicy, latents: tuple[th.Tensor, ...]) -> None:
+        """A time limit is no end: add the discounted value of what would have followed.
+
+        :param policy: The networks
+        :param latents: Last hidden layers of both critics on the rollout, shape (T·W, ...)
+        """
         rewards = self.rewards.reshape(self.buffer_size, self.n_worlds, self.n_agents)
         for step, worlds, observations, critic_states in self.timeouts:
-            values, cost_values = self._values(policy, observations, critic_states)
+            before = tuple(latent[step * self.n_worlds + worlds] for latent in latents)
+            values, cost_values = self._values(policy, observations, critic_states, before)
             rewards[step, worlds] += self.gamma * values
             self.costs[step, worlds] += self.cost_gamma * cost_values
 
     def _values(
-        self, policy: TeamPolicy, observations: np.ndarray, critic_states: np.ndarray
+        self,
+        policy: TeamPolicy,
+        observations: np.ndarray,
+        critic_states: np.ndarray,
+        latents: tuple[th.Tensor, ...],
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Values of observations that follow on steps of the rollout.
+
+        :param policy: The networks
+        :param observations: w teams, shape (w·N, D)
+        :param critic_states: Shape (w, G)
+        :param latents: Last hidden layers of both critics in the step before, shape (w, ...)
+        :return: Shapes (w, N) and (w, K, M)
+        """
         teams = self.to_torch(observations).reshape(-1, self.n_agents, *self.obs_shape)
-        values, cost_values = policy.team_values(teams, self.to_torch(critic_states))
+        sequences = None
+        if policy.recurrent:
+            batch_sizes = th.tensor([len(teams)])
+            sequences = Sequences(batch_sizes, Memory(latents[0], *latents))
+        values, cost_values = policy.team_values(teams, self.to_torch(critic_states), sequences)
         return values.cpu().numpy(), cost_values.cpu().numpy()
 
     def _network_inputs(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
@@ -239,17 +293,33 @@ class TeamRolloutBuffer(RolloutBuffer):
         )
 
     def get(self, batch_size: int | None = None) -> Any:
-        """Not used: minibatches of rows would tear teams apart; see :func:`minibatches`."""
+        """Not used: minibatches of rows would tear teams apart; see :meth:`minibatches`."""
         raise NotImplementedError("a team rollout is read with samples() and minibatches()")
 
+    def minibatches(
+        self, samples: TeamSamples, n_team_steps: int, recurrent: bool
+    ) -> Iterator[tuple[TeamSamples, Sequences | None]]:
+        """Divide a rollout into random minibatches of nearly equal size.
 
-def minibatches(samples: TeamSamples, n_team_steps: int) -> Iterator[TeamSamples]:
-    """Cut a rollout into random minibatches of nearly equal size.
+        :param samples: The rollout
+        :param n_team_steps: Largest number of team steps in a minibatch; about that number if
+            minibatches are made of whole sequences
+        :param recurrent: Whether they are
+        :return: Minibatches that together hold every team step once, and their sequences
+        """
+        if not recurrent:
+            yield from ((batch, None) for batch in _random_steps(samples, n_team_steps))
+            return
+        assert self.initial is not None, "a recurrent rollout needs its initial hidden states"
+        for group in random_groups(cut_at_ends(self.dones), n_team_steps):
+            indices, batch_sizes = packed_rows(group, self.n_worlds)
+            rows = th.from_numpy(indices).to(self.device)
+            sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(group, self.initial))
+            yield TeamSamples(*(field[rows] for field in samples)), sequences
 
-    :param samples: The rollout
-    :param n_team_steps: Largest number of team steps in a minibatch
-    :return: Minibatches that together hold every team step once
-    """
+
+def _random_steps(samples: TeamSamples, n_team_steps: int) -> Iterator[TeamSamples]:
+    """Random minibatches of single team steps; see :meth:`TeamRolloutBuffer.minibatches`."""
     total = len(samples.observations)
     n_batches = -(-total // n_team_steps)
     if n_batches == 1:

@@ -28,7 +28,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
-from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples, minibatches
+from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
 from sb3_e2c.callbacks import OEMRewardCallback
 from sb3_e2c.constraints import (
     CostScope,
@@ -43,7 +43,9 @@ from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
+from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
+from sb3_e2c.sequences import Memory, Sequences
 from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
 
 
@@ -54,7 +56,7 @@ class MAPPO(PPO):
     Exploration" (constraints of a team or of its agents). Arguments that are not listed here are
     those of Stable-Baselines3's PPO; a step is one agent's step, as a row is in Stable-Baselines3.
 
-    :param policy: "MlpPolicy", or a subclass of :class:`sb3_e2c.policies.TeamPolicy`
+    :param policy: "MlpPolicy", "GruPolicy", or a subclass of :class:`sb3_e2c.policies.TeamPolicy`
     :param env: What :func:`sb3_e2c.share_parameters` returns. A PettingZoo parallel environment
         becomes one world; a single-agent environment is a team of one
     :param learning_rate: Of the actor, and of the critics unless they have their own
@@ -75,7 +77,10 @@ class MAPPO(PPO):
     :raises ValueError: for limits or a scope that make no sense, or a batch smaller than a team
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TeamPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": TeamPolicy,
+        "GruPolicy": GruPolicy,
+    }
     policy: TeamPolicy
     rollout_buffer: TeamRolloutBuffer
     multipliers: Multipliers
@@ -254,6 +259,7 @@ class MAPPO(PPO):
             critic_state_dim=self.critic_state_dim,
         )
         self._recorder.start(self._last_obs, env.unwrapped.reset_infos)  # type: ignore[arg-type]
+        self._memory = self.policy.empty_memory(env.num_envs // self.n_agents)
 
     # ------------------------------------------------------------------ collecting
 
@@ -279,12 +285,14 @@ class MAPPO(PPO):
         """
         assert self._last_obs is not None, "no previous observation: learn() resets first"
         self.policy.set_training_mode(False)
-        rollout_buffer.reset()
+        self._memory = self._running(self._memory, self._last_episode_starts)
+        rollout_buffer.reset(self._memory)
+        states = self._memory.actor.flatten(0, 1)
         recorder = self._recorder
         recorder.finished_costs.clear()
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
-            actions = self._sample_actions(self._last_obs)
+            actions, states = self._sample_actions(self._last_obs, states)
             clipped_actions = self._clip_actions(actions)
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             assert isinstance(new_obs, np.ndarray)
@@ -307,16 +315,28 @@ class MAPPO(PPO):
             )
             self._last_obs, self._last_episode_starts = new_obs, dones
         last_obs = np.asarray(self._last_obs)
-        rollout_buffer.finish(self.policy, last_obs, recorder.critic_states)
+        critics = rollout_buffer.finish(self.policy, last_obs, recorder.critic_states)
+        self._memory = Memory(states.view_as(self._memory.actor), *critics)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
 
-    def _sample_actions(self, obs: Any) -> np.ndarray:
+    def _sample_actions(self, obs: Any, states: th.Tensor) -> tuple[np.ndarray, th.Tensor]:
+        """Actions, and the actor's next hidden states, of all slots."""
         with th.no_grad():
             tensor, _ = self.policy.obs_to_tensor(obs)
-            actions = self.policy.get_distribution(tensor).get_actions(deterministic=False)
-        return actions.cpu().numpy().reshape(len(obs), *self.action_space.shape)  # type: ignore[misc]
+            if self.policy.recurrent:
+                running = th.as_tensor(~np.asarray(self._last_episode_starts, bool))
+                states = states * running.to(states)[:, None]
+            actions, states = self.policy.act(tensor, states)  # type: ignore[arg-type]
+        shape = (len(obs), *self.action_space.shape)  # type: ignore[misc]
+        return actions.cpu().numpy().reshape(shape), states
+
+    def _running(self, memory: Memory, episode_starts: Any) -> Memory:
+        """Hidden states with those of worlds at the start of an episode set to zero."""
+        running = ~np.asarray(episode_starts[:: self.n_agents], dtype=bool)
+        factor = th.as_tensor(running, device=self.device)[:, None, None]
+        return Memory(*(states * factor for states in memory))
 
     def _clip_actions(self, actions: np.ndarray) -> np.ndarray:
         if isinstance(self.action_space, spaces.Box):
@@ -349,16 +369,22 @@ class MAPPO(PPO):
 
         :return: False if the policy has moved further than ``target_kl`` allows
         """
-        for batch in minibatches(samples, self.batch_size // self.n_agents):
-            loss, kl = self._loss(batch, logs)
+        batches = self.rollout_buffer.minibatches(
+            samples, self.batch_size // self.n_agents, self.policy.recurrent
+        )
+        for batch, sequences in batches:
+            loss, kl = self._loss(batch, sequences, logs)
             if self.target_kl is not None and kl > 1.5 * self.target_kl:
                 return False
             self._gradient_step(loss)
         return True
 
-    def _loss(self, batch: TeamSamples, logs: dict[str, list[float]]) -> tuple[th.Tensor, float]:
+    def _loss(
+        self, batch: TeamSamples, sequences: Sequences | None, logs: dict[str, list[float]]
+    ) -> tuple[th.Tensor, float]:
         clip_range = self.clip_range(self._current_progress_remaining)
-        new = self.policy.evaluate_steps(batch.observations, batch.actions, batch.critic_states)
+        inputs = (batch.observations, batch.actions, batch.critic_states)
+        new = self.policy.evaluate_steps(*inputs, sequences)
         advantages = batch.advantages
         if self.normalize_advantage:
             advantages = normalize(advantages)
@@ -480,7 +506,7 @@ class MAPPO(PPO):
         return ["policy", "policy.optimizer", "multipliers"], []
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_recorder"]
+        return [*super()._excluded_save_params(), "_recorder", "_memory"]
 
     def save(
         self,

@@ -15,6 +15,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_e2c.sequences import Memory, Sequences
+
 
 class StepEvaluation(NamedTuple):
     """What the networks say about B team steps; each field has the shape behind it."""
@@ -23,6 +25,8 @@ class StepEvaluation(NamedTuple):
     entropy: th.Tensor  # (B, N)
     values: th.Tensor  # (B, N), in units of the value normalizer
     cost_values: th.Tensor  # (B, K, M), in units of the cost value normalizer
+    value_latent: th.Tensor  # (B, 1, H), last hidden layer of the reward critic
+    cost_latent: th.Tensor  # (B, K', H), of the cost critics
 
 
 class RunningNorm(nn.Module):
@@ -129,6 +133,8 @@ class TeamPolicy(ActorCriticPolicy):
     :param kwargs: Arguments of Stable-Baselines3's ``ActorCriticPolicy``
     """
 
+    recurrent = False
+
     def __init__(
         self,
         observation_space: Any,
@@ -201,7 +207,7 @@ class TeamPolicy(ActorCriticPolicy):
             module.apply(partial(self.init_weights, gain=gain))
 
     def _parameter_groups(self, lr_schedule: Schedule) -> list[dict[str, Any]]:
-        critics = [self.mlp_extractor.value_net, self.value_net, self.cost_extractor, self.cost_net]
+        critics = [*self._critic_modules(), *self._cost_modules()]
         critic_params = [p for module in critics for p in module.parameters()]
         critic_ids = {id(p) for p in critic_params}
         actor_params = [p for p in self.parameters() if id(p) not in critic_ids]
@@ -212,41 +218,56 @@ class TeamPolicy(ActorCriticPolicy):
 
     def cost_parameters(self) -> list[nn.Parameter]:
         """Parameters of the cost critics, empty without constraints."""
-        return [*self.cost_extractor.parameters(), *self.cost_net.parameters()]
+        return [p for module in self._cost_modules() for p in module.parameters()]
+
+    def _critic_modules(self) -> list[nn.Module]:
+        return [self.mlp_extractor.value_net, self.value_net]
+
+    def _cost_modules(self) -> list[nn.Module]:
+        return [self.cost_extractor, self.cost_net]
 
     def evaluate_steps(
-        self, observations: th.Tensor, actions: th.Tensor, critic_states: th.Tensor
+        self,
+        observations: th.Tensor,
+        actions: th.Tensor,
+        critic_states: th.Tensor,
+        sequences: Sequences | None = None,
     ) -> StepEvaluation:
         """Evaluate all networks on whole team steps.
 
         :param observations: Shape (B, N, D)
         :param actions: Shape (B, N, A)
         :param critic_states: Shape (B, G)
+        :param sequences: How the steps follow each other, for recurrent policies
         :return: Log-probabilities and entropies of the actions, values, cost values
         """
         n_steps = len(observations)
         pi_features, vf_features = self._slot_features(observations)
-        latent_pi = self.mlp_extractor.forward_actor(pi_features)
+        latent_pi = self._actor_latent(pi_features, sequences)
         distribution = self._get_action_dist_from_latent(latent_pi)
         log_prob = distribution.log_prob(self._flatten_actions(actions))
         entropy = distribution.entropy()
         if entropy is None:  # no analytical form: estimate it from the actions taken
             entropy = -log_prob
-        values, cost_values = self._critics(vf_features, critic_states)
         shape = (n_steps, self.n_agents)
-        return StepEvaluation(log_prob.view(shape), entropy.view(shape), values, cost_values)
+        critics = self._critics(vf_features, critic_states, sequences)
+        return StepEvaluation(log_prob.view(shape), entropy.view(shape), *critics)
 
     def team_values(
-        self, observations: th.Tensor, critic_states: th.Tensor
+        self,
+        observations: th.Tensor,
+        critic_states: th.Tensor,
+        sequences: Sequences | None = None,
     ) -> tuple[th.Tensor, th.Tensor]:
         """Evaluate the critics only, in the units of the rewards and of the costs.
 
         :param observations: Shape (B, N, D)
         :param critic_states: Shape (B, G)
+        :param sequences: See :meth:`evaluate_steps`
         :return: Values (B, N), cost values (B, K, M)
         """
-        values, cost_values = self._critics(self._slot_features(observations)[1], critic_states)
-        return self.denormalize(values, cost_values)
+        features = self._slot_features(observations)[1]
+        return self.denormalize(*self._critics(features, critic_states, sequences)[:2])
 
     def denormalize(self, values: th.Tensor, cost_values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """From the critics' own units to those of the rewards and costs; shapes stay."""
@@ -258,17 +279,50 @@ class TeamPolicy(ActorCriticPolicy):
         return features if isinstance(features, tuple) else (features, features)
 
     def _critics(
-        self, features: th.Tensor, critic_states: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
+        self, features: th.Tensor, critic_states: th.Tensor, sequences: Sequences | None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """Values (B, N), cost values (B, K, M), and the last hidden layers of both critics."""
         joint = features.reshape(len(critic_states), -1)
         if self.critic_state_dim:
             joint = th.cat([joint, critic_states], dim=1)
-        values = self.value_net(self.mlp_extractor.forward_critic(joint))
+        value_latent = self._value_latent(joint, sequences)
+        values = self.value_net(value_latent)
+        by_step = (len(joint), self.n_parties, -1)
         if not self.n_constraints:
-            return values, values.new_zeros(len(joint), self.n_parties, 0)
-        cost_features = joint if self.n_parties == 1 else features
-        cost_values = self.cost_net(self.cost_extractor(cost_features))
-        return values, cost_values.view(len(joint), self.n_parties, self.n_constraints)
+            nothing = values.new_zeros(len(joint), self.n_parties, 0)
+            return values, nothing, value_latent[:, None], nothing
+        cost_latent = self._cost_latent(joint if self.n_parties == 1 else features, sequences)
+        cost_values = self.cost_net(cost_latent)
+        return values, cost_values.view(by_step), value_latent[:, None], cost_latent.view(by_step)
+
+    def _actor_latent(self, features: th.Tensor, sequences: Sequences | None) -> th.Tensor:  # noqa: ARG002
+        """Last hidden layer of the actor, from local features (B·N, F)."""
+        return self.mlp_extractor.forward_actor(features)
+
+    def _value_latent(self, features: th.Tensor, sequences: Sequences | None) -> th.Tensor:  # noqa: ARG002
+        """Last hidden layer of the reward critic, from joint features (B, F)."""
+        return self.mlp_extractor.forward_critic(features)
+
+    def _cost_latent(self, features: th.Tensor, sequences: Sequences | None) -> th.Tensor:  # noqa: ARG002
+        """Last hidden layer of the cost critics, from the features (B·K, F) that they see."""
+        return self.cost_extractor(features)
+
+    def empty_memory(self, n_worlds: int) -> Memory:
+        """Hidden states at the start of an episode; of no size where there is no recurrence.
+
+        :param n_worlds: W
+        """
+        nothing = th.zeros(n_worlds, 1, 0, device=self.device)
+        return Memory(nothing.expand(-1, self.n_agents, -1), nothing, nothing)
+
+    def act(self, obs: th.Tensor, states: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Sample actions.
+
+        :param obs: Observations of any slots, shape (S, D)
+        :param states: Hidden states of the actor, shape (S, H)
+        :return: Actions (S, ...), and the next hidden states
+        """
+        return self.get_distribution(obs).get_actions(deterministic=False), states
 
     def _flatten_actions(self, actions: th.Tensor) -> th.Tensor:
         """Actions (B, N, A) as SB3's distributions want them: (B·N, A), or (B·N,) if discrete."""
