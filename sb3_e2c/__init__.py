@@ -6,9 +6,10 @@ D observation size, K constrained parties (1 for a team, N for individual agents
 """
 
 from sb3_e2c.callbacks import OEMRewardCallback
+from sb3_e2c.e2c_mappo import E2CMAPPO
 from sb3_e2c.entropy import NearestNeighbor, VisitCount
 from sb3_e2c.evaluation import TeamEvalCallback, TeamEvaluation, evaluate_team
-from sb3_e2c.mappo import E2CMAPPO, MAPPO
+from sb3_e2c.mappo import MAPPO
 from sb3_e2c.multipliers import GradientMultipliers, PIDMultipliers
 from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
 

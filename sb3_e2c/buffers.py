@@ -33,10 +33,10 @@ class TeamSamples(NamedTuple):
     critic_states: th.Tensor  # (B, G)
     old_log_prob: th.Tensor  # (B, N)
     advantages: th.Tensor  # (B, N), penalized by the costs
-    old_values: th.Tensor  # (B, N), in the critics' units, as the next three
-    returns: th.Tensor  # (B, N)
-    old_cost_values: th.Tensor  # (B, K, M)
-    cost_returns: th.Tensor  # (B, K, M)
+    old_values: th.Tensor  # (B, N), outputs of the critic before the update
+    returns: th.Tensor  # (B, N), in units of the value normalizer
+    old_cost_values: th.Tensor  # (B, K, M), outputs of the cost critics before the update
+    cost_returns: th.Tensor  # (B, K, M), in units of the cost value normalizer
 
 
 class Timeout(NamedTuple):
@@ -166,6 +166,7 @@ class TeamRolloutBuffer(RolloutBuffer):
         self.values[:] = values.cpu().numpy().reshape(self.values.shape)
         self.cost_values[:] = cost_values.cpu().numpy().reshape(self.cost_values.shape)
         self.compute_returns_and_advantage(*last)
+        self.old_outputs = (evaluation.values, evaluation.cost_values)
         return final[0], final[1]
 
     def _evaluate(self, policy: TeamPolicy) -> StepEvaluation:
@@ -269,14 +270,13 @@ class TeamRolloutBuffer(RolloutBuffer):
         observations, actions, critic_states = self._network_inputs()
         teams = (len(observations), self.n_agents)
         parties = (len(observations), *self.party_shape)
-        values, returns, log_prob, advantages = (
-            self._tensor(a.reshape(teams))
-            for a in (self.values, self.returns, self.log_probs, self.advantages)
+        returns, log_prob, advantages = (
+            self._tensor(a.reshape(teams)) for a in (self.returns, self.log_probs, self.advantages)
         )
-        cost_values, cost_returns, cost_advantages = (
-            self._tensor(a.reshape(parties))
-            for a in (self.cost_values, self.cost_returns, self.cost_advantages)
+        cost_returns, cost_advantages = (
+            self._tensor(a.reshape(parties)) for a in (self.cost_returns, self.cost_advantages)
         )
+        old_values, old_cost_values = self.old_outputs
         if normalize_values:
             policy.value_norm.update(returns[..., None])
             policy.cost_value_norm.update(cost_returns)
@@ -286,9 +286,9 @@ class TeamRolloutBuffer(RolloutBuffer):
             critic_states=critic_states,
             old_log_prob=log_prob,
             advantages=penalized_advantages(advantages, cost_advantages, multipliers),
-            old_values=policy.value_norm.normalize(values),
+            old_values=old_values,
             returns=policy.value_norm.normalize(returns),
-            old_cost_values=policy.cost_value_norm.normalize(cost_values),
+            old_cost_values=old_cost_values,
             cost_returns=policy.cost_value_norm.normalize(cost_returns),
         )
 

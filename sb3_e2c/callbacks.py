@@ -21,7 +21,8 @@ ESTIMATORS: dict[str, type[VisitCount] | type[NearestNeighbor]] = {
 class OEMRewardCallback(BaseCallback):
     """Reward every slot for observations that are new in its episode (Algorithm 1).
 
-    Without ``psi``: r <- beta bonus ("pure"). With it: r <- r_ex + psi beta bonus ("mix").
+    Without ``psi``: r <- beta bonus ("pure"). With it: r <- r_ex + psi beta bonus ("mix"), where
+    r_ex is the reward that the algorithm would learn from (MAPPO has applied ``reward_scale``).
 
     Works with every on-policy algorithm of Stable-Baselines3 and edits rewards before time-outs
     are bootstrapped and before they are stored; monitors have already counted the extrinsic ones.

@@ -20,7 +20,10 @@ def parse_cost_limits(cost_limits: float | Sequence[float] | np.ndarray | None) 
     :return: Limits l, shape (M,), float64
     :raises ValueError: if a limit is negative or not a number
     """
-    limits = np.atleast_1d(np.asarray([] if cost_limits is None else cost_limits, dtype=np.float64))
+    try:
+        limits = np.atleast_1d(np.asarray([] if cost_limits is None else cost_limits, np.float64))
+    except (TypeError, ValueError):
+        limits = np.array([np.nan])
     if limits.ndim != 1 or np.isnan(limits).any() or (limits < 0).any():
         raise ValueError(
             f"cost_limits is {cost_limits!r}; expected None, a number or a list of numbers that "

@@ -34,10 +34,10 @@ def run_sequences(
     """
     if not _is_supported(inputs):
         return gru(PackedSequence(inputs, batch_sizes), initial[None])[0].data
-    projected = F.linear(inputs, gru.weight_ih_l0, gru.bias_ih_l0)
-    return _Recurrence.apply(
-        projected, gru.weight_hh_l0, gru.bias_hh_l0, initial.detach(), batch_sizes.tolist()
-    )
+    weights: Any = gru._flat_weights  # as nn.GRU itself passes them on
+    input_weight, weight, input_bias, bias = weights
+    projected = F.linear(inputs, input_weight, input_bias)
+    return _Recurrence.apply(projected, weight, bias, initial.detach(), batch_sizes.tolist())
 
 
 def run_step(gru: nn.GRU, inputs: th.Tensor, states: th.Tensor) -> th.Tensor:
@@ -95,7 +95,7 @@ class _Recurrence(th.autograd.Function):
         return hidden
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """Gradients of the projected inputs, the recurrent weights and the bias."""
         weight, gates, before = ctx.saved_tensors
         n_rows, size = before.shape
@@ -124,7 +124,7 @@ def _array(tensor: th.Tensor) -> np.ndarray:
 # A rational function in place of tanh: its loops compile to vector instructions. Largest error
 # about 3e-7; coefficients of the usual minimax fit (as in Eigen and XNNPACK).
 @njit(cache=True, inline="always")
-def _tanh(x):  # type: ignore[no-untyped-def]
+def _tanh(x):
     x = min(max(x, np.float32(-7.9)), np.float32(7.9))
     s = x * x
     p = np.float32(-2.76076847742355e-16)
@@ -142,13 +142,13 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _sigmoid(x):  # type: ignore[no-untyped-def]
+def _sigmoid(x):
     half = np.float32(0.5)
     return half * _tanh(half * x) + half
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy", nogil=True)
-def _gates(projected, recurrent, bias, previous, gates, hidden):  # type: ignore[no-untyped-def]
+def _gates(projected, recurrent, bias, previous, gates, hidden):
     """One step of n sequences.
 
     :param projected: shape (n, 3H)
@@ -174,7 +174,7 @@ def _gates(projected, recurrent, bias, previous, gates, hidden):  # type: ignore
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy", nogil=True)
-def _gate_gradients(gradient, gates, before, d_projected, d_recurrent, carried):  # type: ignore[no-untyped-def]
+def _gate_gradients(gradient, gates, before, d_projected, d_recurrent, carried):
     """One step backward of n sequences.
 
     :param gradient: of h', from outside, shape (n, H)

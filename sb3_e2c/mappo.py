@@ -1,4 +1,4 @@
-"""MAPPO with optional cost constraints (Alg. 2), and E2C-MAPPO.
+"""MAPPO with optional cost constraints (Alg. 2).
 
     env.step ─► o' (S, D), r (S,), infos["cost"]       Alg. 2 l. 5-7
       callbacks may edit r in place                    Alg. 1 (OEMRewardCallback)
@@ -13,23 +13,25 @@ K constrained parties (1: the team, N: each agent), M constraints.
 
 import pathlib
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from numbers import Integral
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
-from sb3_e2c.callbacks import OEMRewardCallback
 from sb3_e2c.constraints import (
     CostScope,
     check_cost_scope,
@@ -39,7 +41,7 @@ from sb3_e2c.constraints import (
     violation,
 )
 from sb3_e2c.losses import approx_kl, clip_fraction, normalize, policy_loss, value_loss
-from sb3_e2c.monitor import TeamMonitor
+from sb3_e2c.monitor import TeamMonitor, named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
@@ -47,6 +49,8 @@ from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory, Sequences
 from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
+
+_ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
 
 
 class MAPPO(PPO):
@@ -158,8 +162,8 @@ class MAPPO(PPO):
         self.clip_range_vf = None if clip_range_vf is None else FloatSchedule(clip_range_vf)
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
-        self.agents = _agents(self.env)
-        self.critic_state_dim = getattr(self.env, "critic_state_dim", 0)
+        self.agents, self.critic_state_dim = _team(self.env)
+        self._recorder: TeamRecorder | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -167,18 +171,18 @@ class MAPPO(PPO):
 
     @staticmethod
     def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        if isinstance(env, ParallelEnv):
+        if isinstance(env, (ParallelEnv, AECEnv)):
             world = env
             env = share_parameters(lambda: world, n_worlds=1)
         wrapped = OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if isinstance(wrapped.unwrapped, MultiAgentVecEnv):
-            if not is_vecenv_wrapped(wrapped, TeamMonitor):
-                wrapped = TeamMonitor(wrapped)
-        elif "supersuit" in type(wrapped.unwrapped).__module__:
+        if is_vecenv_wrapped(wrapped, SB3VecEnvWrapper):
             raise TypeError(
                 "env is SuperSuit's own vector environment, which does not say how many agents "
                 "share a world; use sb3_e2c.share_parameters(make_env, n_worlds=...) instead"
             )
+        is_team = isinstance(wrapped.unwrapped, MultiAgentVecEnv)
+        if is_team and not is_vecenv_wrapped(wrapped, TeamMonitor):
+            wrapped = TeamMonitor(wrapped)
         return wrapped
 
     @property
@@ -187,6 +191,8 @@ class MAPPO(PPO):
         return len(self.agents)
 
     def _setup_model(self) -> None:
+        self.cost_limits = parse_cost_limits(self.cost_limits)  # load() may have replaced them
+        check_cost_scope(self.cost_scope)
         self._check_setup()
         parties = n_parties(self.cost_scope, self.n_agents)
         sizes = {
@@ -221,30 +227,51 @@ class MAPPO(PPO):
         self.critic_lr_schedule: Schedule | None = None if own is None else FloatSchedule(own)
 
     def _check_setup(self) -> None:
+        for name in ("n_steps", "batch_size", "n_epochs"):
+            number = getattr(self, name)
+            if not isinstance(number, Integral) or number < 1:
+                raise ValueError(f"{name} is {number!r}; expected a whole number of at least 1")
         if self.batch_size < self.n_agents:
             raise ValueError(
                 f"batch_size is {self.batch_size}, smaller than the team of {self.n_agents} "
                 "agents; a minibatch holds whole team steps, so raise batch_size"
             )
-        self._check_team()
+        for name, kind in (("policy_class", TeamPolicy), ("multipliers_class", Multipliers)):
+            given = getattr(self, name)
+            if not isinstance(given, type) or not issubclass(given, kind):
+                raise TypeError(f"{name} is {given!r}; expected a subclass of {kind.__name__}")
+        if self.env is not None:
+            self._check_team(self.env)
 
-    def _check_team(self) -> None:
-        if self.env is not None and _agents(self.env) != self.agents:
+    def _check_team(self, env: VecEnv) -> None:
+        agents, critic_state_dim = _team(env)
+        if agents != self.agents:
             raise ValueError(
-                f"the environment has the agents {_agents(self.env)}, but the model was made for "
+                f"the environment has the agents {agents}, but the model was made for "
                 f"{self.agents}; use an environment with the same team"
+            )
+        if critic_state_dim != self.critic_state_dim:
+            raise ValueError(
+                f"the environment reports {critic_state_dim} numbers in info['critic_state'], but "
+                f"the model's critics were made for {self.critic_state_dim}; use an environment "
+                "with the same settings"
             )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Use another environment with the same team; see ``PPO.set_env``."""
+        env = self._wrap_env(env, self.verbose)
+        self._check_team(env)
         super().set_env(env, force_reset)
-        self._check_team()
+        self._recorder = None
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
         last_obs = self._last_obs
         result = super()._setup_learn(total_timesteps, *args, **kwargs)
-        if self._last_obs is not last_obs:  # the environment was reset
+        if self._recorder is None or self._last_obs is not last_obs:  # the environment was reset
             self._start_episodes()
+        if self.verbose >= 1:
+            extra = f"and {self.critic_state_dim} numbers of info['critic_state']"
+            print(f"Critics see the joint observation {extra if self.critic_state_dim else 'only'}")
         return result
 
     def _start_episodes(self) -> None:
@@ -289,6 +316,7 @@ class MAPPO(PPO):
         rollout_buffer.reset(self._memory)
         states = self._memory.actor.flatten(0, 1)
         recorder = self._recorder
+        assert recorder is not None, "learn() makes the recorder"
         recorder.finished_costs.clear()
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
@@ -299,8 +327,7 @@ class MAPPO(PPO):
             rewards = self.reward_scale * rewards
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
+            go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
             recorder.record(
                 rollout_buffer,
@@ -314,6 +341,9 @@ class MAPPO(PPO):
                 reset_infos=env.unwrapped.reset_infos,
             )
             self._last_obs, self._last_episode_starts = new_obs, dones
+            if not go_on:  # only now: a later learn() may continue the running episodes
+                self._memory = Memory(states.view_as(self._memory.actor), *self._memory[1:])
+                return False
         last_obs = np.asarray(self._last_obs)
         critics = rollout_buffer.finish(self.policy, last_obs, recorder.critic_states)
         self._memory = Memory(states.view_as(self._memory.actor), *critics)
@@ -328,7 +358,8 @@ class MAPPO(PPO):
             if self.policy.recurrent:
                 running = th.as_tensor(~np.asarray(self._last_episode_starts, bool))
                 states = states * running.to(states)[:, None]
-            actions, states = self.policy.act(tensor, states)  # type: ignore[arg-type]
+            with self._explained_divergence():
+                actions, states = self.policy.act(tensor, states)  # type: ignore[arg-type]
         shape = (len(obs), *self.action_space.shape)  # type: ignore[misc]
         return actions.cpu().numpy().reshape(shape), states
 
@@ -384,7 +415,8 @@ class MAPPO(PPO):
     ) -> tuple[th.Tensor, float]:
         clip_range = self.clip_range(self._current_progress_remaining)
         inputs = (batch.observations, batch.actions, batch.critic_states)
-        new = self.policy.evaluate_steps(*inputs, sequences)
+        with self._explained_divergence():
+            new = self.policy.evaluate_steps(*inputs, sequences)
         advantages = batch.advantages
         if self.normalize_advantage:
             advantages = normalize(advantages)
@@ -423,12 +455,12 @@ class MAPPO(PPO):
         if not th.isfinite(loss):
             raise ValueError(
                 f"the loss is {loss.item()} after {self.num_timesteps} agent steps; training "
-                "stops, the model keeps its last finite parameters. Lower learning_rate or "
-                "reward_scale, or use normalize_values=True"
+                f"stops, the model keeps its last finite parameters. {_ADVICE}"
             )
         self.policy.optimizer.zero_grad()
         loss.backward()
-        # The cost critics are clipped on their own, so that watching a cost changes nothing else.
+        # The cost critics are clipped on their own, so that watching a cost does not change what
+        # the other networks learn (unless they share a features extractor that learns).
         cost_parameters = self.policy.cost_parameters()
         cost_ids = {id(p) for p in cost_parameters}
         others = [p for p in self.policy.parameters() if id(p) not in cost_ids]
@@ -436,8 +468,20 @@ class MAPPO(PPO):
             th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         self.policy.optimizer.step()
 
+    @contextmanager
+    def _explained_divergence(self) -> Iterator[None]:
+        """Say what it means when torch refuses the parameters of an action distribution."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(
+                f"the networks have diverged after {self.num_timesteps} agent steps: the action "
+                f"distribution is not valid any more. {_ADVICE}"
+            ) from error
+
     def _update_multipliers(self) -> None:
         """One dual step from the episodes that finished in this rollout; none without episodes."""
+        assert self._recorder is not None, "learn() makes the recorder"
         finished_costs = self._recorder.finished_costs
         if finished_costs and len(self.cost_limits):
             excess = violation(np.array(finished_costs), self._party_limits)
@@ -460,7 +504,8 @@ class MAPPO(PPO):
         buffer = self.rollout_buffer
         explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", explained)
-        for name, number in self._numbered("lambda", self.multipliers.values.mean(dim=0).tolist()):
+        lambdas = named_costs(self.multipliers.values.mean(dim=0).tolist(), "lambda")
+        for name, number in lambdas.items():
             self.logger.record(f"train/{name}", number)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
@@ -470,12 +515,12 @@ class MAPPO(PPO):
         if self.clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", self.clip_range_vf(progress))
 
-    @staticmethod
-    def _numbered(name: str, numbers: Sequence[float]) -> list[tuple[str, float]]:
-        """Logger keys: the plain name for one constraint, name_0, name_1, ... for several."""
-        if len(numbers) == 1:
-            return [(name, numbers[0])]
-        return [(f"{name}_{j}", number) for j, number in enumerate(numbers)]
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        """Note one record for each world's episode, not for each agent's."""
+        n = self.n_agents
+        super()._update_info_buffer(infos[::n], None if dones is None else dones[::n])
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write the log; adds the episode costs and the number of environment steps."""
@@ -528,43 +573,9 @@ class MAPPO(PPO):
             super().save(file, exclude, include)  # type: ignore[arg-type]
 
 
-class E2CMAPPO(MAPPO):
-    """E2C-MAPPO: MAPPO that explores by observation entropy (Alg. 1 and 2).
+def _team(env: VecEnv | None) -> tuple[list[str], int]:
+    """Names of a team's agents and the size of the critics' extra state.
 
-    The same as ``MAPPO`` with an :class:`sb3_e2c.OEMRewardCallback` as the first callback of
-    every ``learn``, unless the caller passes one.
-
-    :param args: See :class:`MAPPO`
-    :param oem_kwargs: Arguments of the callback; default: the bonus of the 5th nearest neighbor
-        alone ("pure"), as the paper has it for the particle tasks
-    :param kwargs: See :class:`MAPPO`
+    :param env: A single-agent environment is a team of one
     """
-
-    def __init__(self, *args: Any, oem_kwargs: dict[str, Any] | None = None, **kwargs: Any):
-        self.oem_kwargs = oem_kwargs or {
-            "estimator": "nearest_neighbor",
-            "estimator_kwargs": {"k": 5},
-        }
-        super().__init__(*args, **kwargs)
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self._oem_callback = OEMRewardCallback(**self.oem_kwargs)
-
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        given = callback if isinstance(callback, (list, CallbackList)) else [callback]
-        callbacks = given.callbacks if isinstance(given, CallbackList) else given
-        if any(isinstance(each, OEMRewardCallback) for each in callbacks):
-            return super()._init_callback(callback, progress_bar)
-        rest = super()._init_callback(callback, progress_bar)
-        both = CallbackList([self._oem_callback, rest])
-        both.init_callback(self)
-        return both
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_oem_callback"]
-
-
-def _agents(env: VecEnv | None) -> list[str]:
-    """Names of a team's agents; a single-agent environment is a team of one."""
-    return list(getattr(env, "agents", ["agent"]))
+    return list(getattr(env, "agents", ["agent"])), getattr(env, "critic_state_dim", 0)

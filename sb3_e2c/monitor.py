@@ -15,7 +15,7 @@ from sb3_e2c.vec_env import MultiAgentVecEnv
 class TeamMonitor(VecMonitor):
     """``VecMonitor`` for teams: return, length and cost of every world's episode.
 
-    When a world's episode ends, the info of its first slot gets
+    When a world's episode ends, the infos of its slots get
     ``info["episode"] = {"r": team return, "l": steps, "t": seconds, "cost": team cost}``, with
     ``cost_0, cost_1, ...`` if there are several costs and no cost where none is reported. What
     the team's return and cost are is said by ``env.team_return`` and ``env.team_cost``.
@@ -49,9 +49,12 @@ class TeamMonitor(VecMonitor):
         self.episode_returns += team_rewards(raw_rewards(self.venv, rewards), self._team)
         self.episode_lengths += 1
         self.episode_costs = add_costs(self.episode_costs, costs)
-        for world in np.flatnonzero(dones[:: self._team.n_agents]).tolist():
-            info = infos[world * self._team.n_agents]
-            info["episode"] = self._finish(world, info)
+        n_agents = self._team.n_agents
+        for world in np.flatnonzero(dones[::n_agents]).tolist():
+            record = self._finish(world, infos[world * n_agents])
+            # in every slot: SB3's evaluate_policy waits for one from each row
+            for info in infos[world * n_agents : (world + 1) * n_agents]:
+                info["episode"] = record
         return observations, rewards, dones, infos
 
     def _start_episodes(self) -> None:

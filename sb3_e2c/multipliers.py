@@ -6,6 +6,7 @@ ones, and changes it with one verb, ``update(violation)``.
 
 import math
 from abc import ABC, abstractmethod
+from numbers import Real
 from typing import Any
 
 import torch as th
@@ -113,7 +114,11 @@ class PIDMultipliers(Multipliers):
         self.values.copy_(values.clamp_(0.0, self.maximum))
 
 
-def _check(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if not value >= 0:
+def _check(initial: float, maximum: float, **gains: float) -> None:
+    for name, value in {"initial": initial, "maximum": maximum, **gains}.items():
+        if not isinstance(value, Real) or not value >= 0:
             raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")
+    if not math.isfinite(initial) or initial > maximum:
+        raise ValueError(
+            f"multipliers: initial is {initial!r}; expected a finite number of at most {maximum!r}"
+        )

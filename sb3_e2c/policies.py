@@ -221,7 +221,8 @@ class TeamPolicy(ActorCriticPolicy):
         return [p for module in self._cost_modules() for p in module.parameters()]
 
     def _critic_modules(self) -> list[nn.Module]:
-        return [self.mlp_extractor.value_net, self.value_net]
+        own_features = [] if self.share_features_extractor else [self.vf_features_extractor]
+        return [*own_features, self.mlp_extractor.value_net, self.value_net]
 
     def _cost_modules(self) -> list[nn.Module]:
         return [self.cost_extractor, self.cost_net]
@@ -375,11 +376,22 @@ def parse_net_arch(net_arch: list[int] | dict[str, list[int]] | None) -> dict[st
     if net_arch is None:
         net_arch = [64, 64]
     if not isinstance(net_arch, dict):
-        return {"pi": list(net_arch), "vf": list(net_arch), "cvf": list(net_arch)}
+        net_arch = {"pi": net_arch, "vf": net_arch}
     unknown = set(net_arch) - {"pi", "vf", "cvf"}
     if unknown:
         raise ValueError(
             f"net_arch has the keys {sorted(net_arch)}; expected 'pi', 'vf' and optionally 'cvf'"
         )
     vf = net_arch.get("vf", [])
-    return {"pi": net_arch.get("pi", []), "vf": vf, "cvf": net_arch.get("cvf", vf)}
+    parsed = {"pi": net_arch.get("pi", []), "vf": vf, "cvf": net_arch.get("cvf", vf)}
+    for name, sizes in parsed.items():
+        if not isinstance(sizes, (list, tuple)) or not all(_is_size(size) for size in sizes):
+            raise ValueError(
+                f"net_arch has {sizes!r} for {name!r}; expected a list of layer sizes, such as "
+                "[128, 128]"
+            )
+    return {name: list(sizes) for name, sizes in parsed.items()}
+
+
+def _is_size(size: object) -> bool:
+    return isinstance(size, int) and not isinstance(size, bool) and size > 0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_e2c.buffers import TeamRolloutBuffer, Timeout
-from sb3_e2c.constraints import check_n_costs, party_costs, read_costs
+from sb3_e2c.constraints import check_n_costs, n_parties, party_costs, read_costs
 
 Infos = Sequence[dict[str, Any]]
 
@@ -53,10 +53,10 @@ class TeamRecorder:
         :param observations: Shape (S, D)
         :param reset_infos: One dict for each slot
         """
-        parties = 1 if self.cost_scope == "team" else self.n_agents
+        parties = n_parties(self.cost_scope, self.n_agents)
         self.episode_costs = np.zeros((self.n_worlds, parties, self.n_constraints))
         self.critic_states = self._critic_states(reset_infos)
-        self._check_finite(n_steps=0, observation=observations)
+        self._check_finite(0, observation=observations)
 
     def record(
         self,
@@ -110,7 +110,17 @@ class TeamRecorder:
         """Extra state of the critics, shape (W, G)."""
         if not self.critic_state_dim:
             return np.zeros((self.n_worlds, 0), np.float32)
-        return np.array([info["critic_state"] for info in infos[:: self.n_agents]], np.float32)
+        found = [info.get("critic_state", ()) for info in infos[:: self.n_agents]]
+        for world, state in enumerate(found):
+            if np.shape(state) != (self.critic_state_dim,):
+                raise ValueError(
+                    f"info['critic_state'] of world {world} has the shape {np.shape(state)}; "
+                    f"expected ({self.critic_state_dim},), at every reset and every step"
+                )
+        states = np.array(found, np.float32)
+        slots = np.repeat(states, self.n_agents, axis=0)
+        self._check_finite(None, critic_state=slots)
+        return states
 
     def _timeout(
         self, step: int, ended: np.ndarray, infos: Infos, critic_states: np.ndarray
@@ -118,29 +128,39 @@ class TeamRecorder:
         cut_off = [
             world
             for world in np.flatnonzero(ended).tolist()
-            if infos[world * self.n_agents].get("TimeLimit.truncated", False)
+            if all(info.get("TimeLimit.truncated", False) for info in self._team(infos, world))
         ]
         if not cut_off:
             return None
         worlds = np.array(cut_off)
-        slots = (worlds[:, None] * self.n_agents + np.arange(self.n_agents)).ravel().tolist()
-        observations = np.array([infos[slot]["terminal_observation"] for slot in slots])
+        last = [[i["terminal_observation"] for i in self._team(infos, w)] for w in cut_off]
+        observations = np.concatenate([np.array(team) for team in last])
+        self._check_finite(step, worlds, terminal_observation=observations)
         return Timeout(step, worlds, observations, critic_states[worlds])
 
-    def _check_finite(self, n_steps: int, **quantities: np.ndarray) -> None:
+    def _team(self, infos: Infos, world: int) -> Infos:
+        """Infos of the agents of a world."""
+        return infos[world * self.n_agents : (world + 1) * self.n_agents]
+
+    def _check_finite(
+        self, n_steps: int | None, worlds: np.ndarray | None = None, **quantities: np.ndarray
+    ) -> None:
         """Stop before a number that is not finite reaches the networks.
 
-        :param n_steps: Steps of this rollout so far
-        :param quantities: Arrays by name, shape (S, ...)
+        :param n_steps: Steps of this rollout so far, if known
+        :param worlds: Numbers of the w worlds that the arrays are about; None: all
+        :param quantities: Arrays by name, shape (w·N, ...)
         """
         for name, array in quantities.items():
             finite = np.isfinite(array)
             if finite.all():
                 continue
             first = int(np.argwhere(~finite)[0, 0])
-            world, agent = divmod(first, self.n_agents)
+            row, agent = divmod(first, self.n_agents)
+            world = row if worlds is None else worlds[row]
+            when = "" if n_steps is None else f" at step {n_steps} of the rollout"
             raise ValueError(
-                f"{name} of world {world}, agent {self.agents[agent]!r} is not finite at step "
-                f"{n_steps} of the rollout: {array[first]}. Training stops, the model keeps its "
-                "last parameters; mend the environment, or bound this quantity"
+                f"{name} of world {world}, agent {self.agents[agent]!r} is not finite{when}: "
+                f"{array[first]}. Training stops, the model keeps its last parameters; mend the "
+                "environment, or bound this quantity"
             )

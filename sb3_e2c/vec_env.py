@@ -12,6 +12,7 @@ episode's last step.
 """
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -64,7 +65,7 @@ def share_parameters(
         ``env.metadata["team_cost"]``, else "sum"
     :return: S = W·N slots
     """
-    _check_request(make_env, n_worlds, n_processes, backend)
+    _check_request(make_env, n_worlds, n_processes, backend, seed)
     example = new_env(make_env)
     critic_state_dim = _critic_state_dim(example)
     worlds: Worlds
@@ -277,13 +278,20 @@ def _team_rule(name: str, rule: str | None, metadata: dict[str, Any], kind: Any)
     return rule
 
 
-def _check_request(make_env: Any, n_worlds: int, n_processes: int, backend: str) -> None:
+def _check_request(
+    make_env: Any, n_worlds: int, n_processes: int, backend: str, seed: int | None
+) -> None:
     if not callable(make_env):
         raise TypeError(
             f"make_env is an object of type {type(make_env).__name__}; expected a function that "
             "makes a new environment at every call, such as "
             "lambda: multi_rover_v0.parallel_env(n_rovers=6)"
         )
+    for name, number in (("n_worlds", n_worlds), ("n_processes", n_processes)):
+        if not isinstance(number, Integral):
+            raise TypeError(f"{name} is {number!r}; expected a whole number")
+    if seed is not None and (not isinstance(seed, Integral) or seed < 0):
+        raise ValueError(f"seed is {seed!r}; expected a whole number of at least 0, or None")
     if n_worlds < 1:
         raise ValueError(f"n_worlds is {n_worlds}; expected at least 1 world")
     if not 1 <= n_processes <= n_worlds:

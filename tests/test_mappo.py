@@ -10,10 +10,12 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import (
     BaseCallback,
+    CallbackList,
     CheckpointCallback,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_e2c import (
@@ -92,8 +94,10 @@ class TestShapes:
         model.learn(32)
         assert model.rollout_buffer.cost_advantages.shape == (8, 2, parties, 3)
 
-    def test_only_critics_see_the_extra_state(self):
-        policy = make(env=line(critic_state=True)).policy
+    def test_only_critics_see_the_extra_state_and_the_run_says_so(self, capsys):
+        model = make(env=line(critic_state=True), verbose=1).learn(32)
+        assert "and 1 numbers of info['critic_state']" in capsys.readouterr().out
+        policy = model.policy
         assert policy.mlp_extractor.value_net[0].in_features == 2 * 3 + 1
         assert policy.mlp_extractor.policy_net[0].in_features == 3
 
@@ -341,10 +345,15 @@ class TestSaving:
         solo.agents = ["agent_0"]
         with pytest.raises(ValueError, match=r"has the agents \['agent_0'\], but the model"):
             MAPPO.load(tmp_path / "model", env=solo)
+        model = make()
+        before = model.env
         other = line()
         other.agents = ["x", "y"]
         with pytest.raises(ValueError, match=r"has the agents \['x', 'y'\], but the model"):
-            make().set_env(other)
+            model.set_env(other)
+        with pytest.raises(ValueError, match=r"reports 1 numbers in info\['critic_state'\], but"):
+            model.set_env(line(critic_state=True))
+        assert model.env is before
 
     def test_a_crash_while_saving_leaves_the_old_file(self, tmp_path, monkeypatch):
         model = make()
@@ -373,6 +382,48 @@ class TestSaving:
         assert model.multipliers.values.item() == pytest.approx(32.0)
 
 
+class TestGoingOn:
+    def test_a_callback_that_stops_leaves_the_episode_costs_right(self):
+        # all fast: every episode costs 8
+        model = make(cost_limits=0.0, multipliers_kwargs={"learning_rate": 1.0})
+        all_fast(model).learn(10_000, callback=StopTrainingOnMaxEpisodes(max_episodes=1))
+        model.learn(32, reset_num_timesteps=False)
+        assert np.ravel(model._recorder.finished_costs).tolist() == [8.0] * 4
+
+    @pytest.mark.parametrize("limits", [5.0, [5.0]])
+    def test_a_limit_can_be_changed_while_loading(self, tmp_path, limits):
+        make(cost_limits=1.0).save(tmp_path / "model")
+        loaded = MAPPO.load(tmp_path / "model", env=line(), device="cpu", cost_limits=limits)
+        assert all_fast(loaded).learn(32).multipliers.values.item() == pytest.approx(0.05 * 3)
+
+    def test_an_environment_need_not_be_reset(self, tmp_path):
+        env = line()
+        make(env=env).learn(32).save(tmp_path / "model")
+        loaded = MAPPO.load(tmp_path / "model", env=env, force_reset=False, device="cpu")
+        loaded.learn(32, reset_num_timesteps=False)
+        assert loaded.num_timesteps == 64
+
+    def test_clipped_values_and_normalized_values_go_together(self):
+        # returns around 400 move the normalizer a lot after the first rollout
+        class Rich(TwoOnALine):
+            batched = None
+
+            def step(self, actions):
+                obs, rewards, *rest = super().step(actions)
+                return obs, {agent: reward + 100.0 for agent, reward in rewards.items()}, *rest
+
+        errors = []
+        for clip in (None, 0.2):
+            env = share_parameters(Rich, 2)
+            model = make(
+                env=env, normalize_values=True, clip_range_vf=clip, learning_rate=3e-3, n_epochs=10
+            )
+            model.learn(32 * 20)
+            buffer = model.rollout_buffer
+            errors.append(np.square(buffer.values - buffer.returns).mean())
+        assert errors[1] < 10 * errors[0]
+
+
 class TestEntropy:
     def test_e2c_gives_the_bonus_of_the_fifth_neighbor_by_default(self):
         model = make(E2CMAPPO, env=line(end="terminated")).learn(32)
@@ -392,11 +443,25 @@ class TestEntropy:
         np.testing.assert_allclose(bonus[:4, 0], [0.5, 0.25, 0.5 / 3, 0.125], rtol=1e-6)
         assert recorded.values["rollout/ep_oem_mean"] == pytest.approx(1 + 1 / 2 + 1 / 3 + 1 / 4)
 
-    def test_a_callback_of_the_users_own_replaces_it(self):
+    @pytest.mark.parametrize("wrap", [lambda own: own, lambda own: [CallbackList([own])]])
+    def test_a_callback_of_the_users_own_replaces_it(self, wrap):
         own = OEMRewardCallback(VisitCount(), psi=None)
         model = make(E2CMAPPO, env=line(end="terminated"))
-        model.learn(32, callback=[own])
+        model.learn(32, callback=wrap(own))
         assert (model.rollout_buffer.rewards[[0, 4]] == 1.0).all()
+
+    def test_other_callbacks_are_initialized_once(self):
+        calls = []
+
+        class Counted(BaseCallback):
+            def _init_callback(self):
+                calls.append("init")
+
+            def _on_step(self):
+                return True
+
+        make(E2CMAPPO).learn(32, callback=[Counted(), lambda *_: True])
+        assert calls == ["init"]
 
     def test_mappo_with_the_callback_is_e2c(self):
         kwargs = {"estimator": "nearest_neighbor", "estimator_kwargs": {"k": 5}}
@@ -422,11 +487,17 @@ class TestRunning:
         model = make().learn(10_000, callback=StopTrainingOnMaxEpisodes(max_episodes=2))
         assert model.num_timesteps == 2 * 4 * 4
 
-    def test_observations_can_be_normalized(self):
+    def test_observations_can_be_normalized_and_so_are_the_last_ones_of_an_episode(self):
         env = VecNormalize(line(spread=5), gamma=0.99)
-        model = make(env=env, cost_limits=2.0).learn(64)
-        assert model.get_vec_normalize_env() is not None
-        assert len(model.ep_info_buffer) == 8
+        model = make(env=env, cost_limits=2.0)
+        model.learn(32)
+        timeouts = model.rollout_buffer.timeouts
+        assert [timeout.step for timeout in timeouts] == [3, 7]
+        positions = env.unnormalize_obs(timeouts[0].observations)[:, 2]
+        # normalized with the statistics of that moment: t = 4 looks far above the mean, not 4
+        assert (timeouts[0].observations[:, 2] > 1.0).all()
+        assert positions == pytest.approx(4.0, abs=1.0)
+        assert model.ep_info_buffer[0]["r"] >= 8  # reported as the environment gives it
 
     def test_a_pettingzoo_environment_is_one_world(self):
         model = make(env=TwoOnALine()).learn(16)
@@ -445,7 +516,12 @@ class TestRunning:
         assert [g["lr"] for g in model.policy.optimizer.param_groups] == [0.25, 0.5]
 
     def test_ppo_learns_on_the_same_slots(self):
-        PPO("MlpPolicy", line(), n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(32)
+        env = line(n_worlds=16)
+        model = PPO(
+            "MlpPolicy", env, n_steps=4, batch_size=64, gamma=0.9, seed=0, device="cpu",
+            learning_rate=3e-3,
+        ).learn(4000)  # fmt: skip
+        assert evaluate_team(model, env, 16).mean_return == 16.0  # all fast
 
 
 class TestErrors:
@@ -457,11 +533,53 @@ class TestErrors:
             ({"batch_size": 1}, "batch_size is 1, smaller than the team of 2 agents"),
             ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8]}}}, "expected 'pi', 'vf'"),
             ({"cost_limits": 1, "multipliers_kwargs": {"initial": -1}}, "initial is -1; expected"),
+            ({"cost_limits": "much"}, "cost_limits is 'much'; expected None, a number"),
+            ({"n_epochs": 0}, "n_epochs is 0; expected a whole number of at least 1"),
+            ({"batch_size": "x"}, "batch_size is 'x'; expected a whole number"),
+            ({"policy_kwargs": {"net_arch": [-3]}}, "expected a list of layer sizes"),
+            ({"multipliers_class": "PID"}, "multipliers_class is 'PID'; expected a subclass"),
         ],
     )
     def test_arguments_that_make_no_sense_are_refused(self, kwargs, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((ValueError, TypeError), match=message):
             make(**kwargs)
+
+    def test_a_policy_of_another_kind_is_refused(self):
+        with pytest.raises(TypeError, match=r"policy_class is .*expected a subclass of TeamPolicy"):
+            MAPPO(ActorCriticPolicy, line(), device="cpu")
+
+    def test_the_last_observation_must_be_finite_too(self):
+        class Broken(TwoOnALine):
+            batched = None
+
+            def step(self, actions):
+                obs, *rest = super().step(actions)
+                if self.t == self.length:
+                    obs["agent_1"][0] = np.nan
+                return obs, *rest
+
+        model = make(env=share_parameters(Broken, 2))
+        with pytest.raises(ValueError, match="terminal_observation of world 0, agent 'agent_1' is"):
+            model.learn(32)
+
+    def test_a_missing_critic_state_is_located(self):
+        class Forgetful(TwoOnALine):
+            batched = None
+
+            def step(self, actions):
+                *rest, infos = super().step(actions)
+                return *rest, {agent: {"cost": 0.0} for agent in infos}
+
+        model = make(env=share_parameters(lambda: Forgetful(critic_state=True), 2))
+        with pytest.raises(
+            ValueError, match=r"'critic_state'\] of world 0 has the shape \(0,\); ex"
+        ):
+            model.learn(32)
+
+    def test_parameters_that_explode_are_explained(self):
+        model = make(learning_rate=1e30)
+        with pytest.raises(ValueError, match=r"have diverged after .* Lower learning_rate"):
+            model.learn(320)
 
     @pytest.mark.parametrize("quantity", ["observation", "reward", "cost"])
     @pytest.mark.parametrize("number", [np.nan, np.inf])

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from conftest import FAST, SLOW, TwoOnALine
 from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_e2c import MAPPO, evaluate_team
 from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.vec_env import share_parameters
 
@@ -33,10 +35,10 @@ def episodes(venv, n_steps, actions=(SLOW, FAST)):
     return [record and {k: v for k, v in record.items() if k != "t"} for record in records]
 
 
-def test_the_first_slot_of_an_ended_world_has_the_record_of_the_team():
+def test_every_slot_of_an_ended_world_has_the_record_of_the_team():
     # Four steps: agent_0 slow earns 4, agent_1 fast 8 at cost 4.
     record = {"r": 12.0, "l": 4, "cost": 4.0}
-    assert episodes(monitored(), 4) == [record, None, record, None]
+    assert episodes(monitored(), 4) == [record] * 4
 
 
 def test_there_is_no_record_before_the_end():
@@ -64,7 +66,7 @@ def test_worlds_end_on_their_own_and_begin_again_at_zero():
     venv = monitored()
     venv.set_options([{"length": 1}] * 2 + [{"length": 3}] * 2)
     record = {"r": 3, "l": 1, "cost": 1}
-    assert episodes(venv, 3) == [record, None, {"r": 9, "l": 3, "cost": 3}, None]
+    assert episodes(venv, 3) == [record] * 2 + [{"r": 9, "l": 3, "cost": 3}] * 2
 
 
 def test_a_reset_forgets_the_running_episode():
@@ -108,13 +110,24 @@ def test_more_of_the_last_info_can_be_recorded():
     assert episodes(venv, 4)[0]["critic_state"] == 1.0  # t / length
 
 
-def test_stable_baselines3_logs_one_entry_for_each_episode_of_a_world():
-    model = PPO(
-        "MlpPolicy", monitored(), n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu"
-    )
+@pytest.mark.parametrize(("algorithm", "entries_of_an_episode"), [(MAPPO, 1), (PPO, 2)])
+def test_mappo_logs_one_entry_for_each_episode_of_a_world(algorithm, entries_of_an_episode):
+    settings = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "seed": 0, "device": "cpu"}
+    model = algorithm("MlpPolicy", monitored(), **settings)
     model.learn(8 * 4)
-    assert len(model.ep_info_buffer) == 4  # two worlds, two episodes of four steps
+    # two worlds, two episodes of four steps; PPO takes every agent for an environment
+    assert len(model.ep_info_buffer) == 4 * entries_of_an_episode
     assert {info["l"] for info in model.ep_info_buffer} == {4}
+
+
+def test_sb3s_own_evaluation_comes_to_an_end():
+    settings = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "seed": 0, "device": "cpu"}
+    model = MAPPO("MlpPolicy", monitored(), **settings)
+    returns, lengths = evaluate_policy(
+        model, model.get_env(), n_eval_episodes=4, return_episode_rewards=True
+    )
+    assert returns == [evaluate_team(model, model.get_env(), 1).returns[0]] * 4
+    assert lengths == [4] * 4
 
 
 def test_an_environment_without_teams_is_refused():
