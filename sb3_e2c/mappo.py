@@ -461,10 +461,7 @@ class MAPPO(PPO):
         loss.backward()
         # The cost critics are clipped on their own, so that watching a cost does not change what
         # the other networks learn (unless they share a features extractor that learns).
-        cost_parameters = self.policy.cost_parameters()
-        cost_ids = {id(p) for p in cost_parameters}
-        others = [p for p in self.policy.parameters() if id(p) not in cost_ids]
-        for parameters in (others, cost_parameters):
+        for parameters in self.policy.clipped_parameters():
             th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         self.policy.optimizer.step()
 

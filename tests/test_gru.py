@@ -8,8 +8,9 @@ from torch.nn.utils.rnn import PackedSequence
 
 from sb3_e2c.gru import _tanh, run_sequences, run_step
 
-UNEVEN = th.tensor([5, 5, 3, 1, 1])
-EVEN = th.tensor([4, 4, 4])
+UNEVEN = th.tensor([7, 7, 5, 1, 1])
+EVEN = th.tensor([6, 6, 6])
+FEW = th.tensor([3, 3, 2, 1])  # compiled as a whole
 
 
 def problem(batch_sizes, size=17, n_inputs=9):
@@ -26,7 +27,7 @@ def with_gradients(output, gru, inputs):
     return [output, *th.autograd.grad((output * weights).sum(), [inputs, *gru.parameters()])]
 
 
-@pytest.mark.parametrize("batch_sizes", [UNEVEN, EVEN, th.tensor([3])], ids=str)
+@pytest.mark.parametrize("batch_sizes", [UNEVEN, EVEN, FEW, th.tensor([9])], ids=str)
 def test_states_and_gradients_are_those_of_torch(batch_sizes):
     gru, inputs, initial = problem(batch_sizes)
     ours = with_gradients(run_sequences(gru, inputs, batch_sizes, initial), gru, inputs)
@@ -54,3 +55,4 @@ def test_the_rational_tanh_is_accurate_everywhere():
     x = np.concatenate([np.linspace(-12, 12, 20001), [0.0, 1e-20, -1e30, 1e30]]).astype(np.float32)
     approximate = np.array([_tanh.py_func(each) for each in x])
     assert np.abs(approximate - np.tanh(x.astype(np.float64))).max() < 5e-7
+    assert np.isnan(_tanh(np.float32(np.nan)))
