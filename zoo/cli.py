@@ -11,6 +11,7 @@ COMMANDS = {
     "enjoy": "evaluate a trained team",
     "demo": "train, evaluate and film one team in a few minutes",
     "plots": "draw the learning curves of a run",
+    "speed": "train beside other libraries and compare the speed",
 }
 
 
