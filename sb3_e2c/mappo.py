@@ -60,6 +60,12 @@ class MAPPO(PPO):
     Exploration" (constraints of a team or of its agents). Arguments that are not listed here are
     those of Stable-Baselines3's PPO; a step is one agent's step, as a row is in Stable-Baselines3.
 
+    What an environment may put into its infos, for every agent:
+
+    - ``cost``: a number, or M numbers, in the info of every step; needed with ``cost_limits``.
+    - ``critic_state``: a 1-D array, equal for all agents of a world, in the infos of every reset
+      and step. Critics see it beside the joint observation, actors never do (docs/paper.md, D18).
+
     :param policy: "MlpPolicy", "GruPolicy", or a subclass of :class:`sb3_e2c.policies.TeamPolicy`
     :param env: What :func:`sb3_e2c.share_parameters` returns. A PettingZoo parallel environment
         becomes one world; a single-agent environment is a team of one

@@ -12,9 +12,9 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
+from sb3_e2c import E2CMAPPO, MAPPO
 from sb3_e2c.callbacks import OEMRewardCallback
 from sb3_e2c.entropy import EntropyEstimator, NearestNeighbor, VisitCount
-from sb3_e2c.mappo import E2CMAPPO, MAPPO
 from sb3_e2c.vec_env import share_parameters
 
 # Bonuses of Squares with one neighbor: o_1, o_2, ... = 1, 4, 9, ... are 3, 5, 7, ... apart

@@ -1,31 +1,38 @@
 """The command line: what is trained, what is written, what is refused."""
 
 import base64
+import io
 import json
+import math
 import pickle
 import re
 import shutil
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 import yaml
 
 pytest.importorskip("rl_zoo3")
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_e2c import E2CMAPPO
+from sb3_e2c import E2CMAPPO, GradientMultipliers, OEMRewardCallback
 from sb3_e2c.envs import ENV_IDS
-from sb3_e2c.zoo import cli, demo, enjoy, hyperparams, train
+from sb3_e2c.multipliers import Multipliers
+from sb3_e2c.zoo import cli, configuration, demo, enjoy, train
 from sb3_e2c.zoo.build import make_worlds
-from sb3_e2c.zoo.console import UserError, parse_value, write_whole
-from sb3_e2c.zoo.hyperparams import FOLDER, merge, read_yaml, resolve
+from sb3_e2c.zoo.configuration import FOLDER, merge, read_yaml, resolve
+from sb3_e2c.zoo.console import UserError, check_device, check_writable, parse_value, write_whole
 from sb3_e2c.zoo.normalization import load_statistics, save_statistics
+from sb3_e2c.zoo.parts import CLASSES, classes_in
 from sb3_e2c.zoo.plots import plot_learning
 from sb3_e2c.zoo.runs import make_env, open_run
+from sb3_e2c.zoo.signatures import arguments_of
 
 ENV = "MultiRover-6-3-v0"
 N = 6
@@ -123,7 +130,7 @@ def test_the_table_reaches_the_run():
 
 
 def test_the_five_methods_are_settings_of_one_algorithm():
-    configs = {algo: resolve(algo, ENV) for algo in hyperparams.ALGORITHMS}
+    configs = {algo: resolve(algo, ENV) for algo in configuration.ALGORITHMS}
     entropy = {algo for algo, config in configs.items() if config["ent_coef"] > 0}
     individual = {a for a, config in configs.items() if config.get("cost_scope") == "individual"}
     assert entropy == {"mappo", "c_mappo_pe"}
@@ -133,7 +140,7 @@ def test_the_five_methods_are_settings_of_one_algorithm():
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
-@pytest.mark.parametrize("algo", hyperparams.ALGORITHMS)
+@pytest.mark.parametrize("algo", configuration.ALGORITHMS)
 def test_every_task_has_hyperparameters_for_every_method(env_id, algo):
     config = resolve(algo, env_id)
     n_agents = len(ENV_IDS[env_id](**config["env_kwargs"]).possible_agents)
@@ -141,12 +148,12 @@ def test_every_task_has_hyperparameters_for_every_method(env_id, algo):
 
 
 def test_shipped_files_have_only_keys_that_some_algorithm_reads():
-    known = set().union(*(hyperparams.keys(algo) for algo in hyperparams.ALGORITHMS))
+    known = set().union(*(configuration.keys(algo) for algo in configuration.ALGORITHMS))
     tables = {name: read_yaml(FOLDER / f"{name}.yml") for name in ("envs", "algos", "presets")}
     entries = [read_yaml(FOLDER / "defaults.yml")]
     entries += [entry for table in tables.values() for entry in table.values()]
     assert set().union(*entries) - {"base"} <= known
-    assert set(tables["algos"]) == set(hyperparams.ALGORITHMS)
+    assert set(tables["algos"]) == set(configuration.ALGORITHMS)
 
 
 def test_presets_combine_and_parameters_come_last():
@@ -217,20 +224,98 @@ def test_values_on_the_command_line_are_read_never_executed(text, value):
     ("overrides", "message"),
     [
         ({"gama": 0.9}, "unknown hyperparameter for e2c_t 'gama'; did you mean 'gamma'"),
-        ({"gamma": 1.5}, "gamma is 1.5; expected between 0 and 1"),
-        ({"n_steps": "many"}, "n_steps is 'many'; expected int"),
+        ({"gamma": 1.5}, "gamma is 1.5; expected at most 1"),
+        ({"n_steps": "many"}, "n_steps is 'many'; expected a whole number$"),
         ({"n_epochs": True}, "n_epochs is True"),
         ({"n_envs": -2}, "n_envs is -2; expected at least 1"),
         ({"cost_limits": [-5.0]}, "cost_limits is .* expected at least 0"),
-        ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
+        ({"learning_rate": "fast"}, "learning_rate is 'fast'; expected a number or a schedule"),
+        ({"learning_rate": "lin_e"}, "learning_rate is 'lin_e'"),
+        ({"learning_rate": "lin_inf"}, "learning_rate is 'lin_inf'"),
+        ({"critic_learning_rate": "lin_-3"}, "critic_learning_rate is 'lin_-3'; .* at least 0"),
+        ({"clip_range_vf": -1}, "clip_range_vf is -1; expected at least 0"),
+        ({"stats_window_size": 10**33}, "stats_window_size is 1000.* expected at most"),
         ({"cost_scope": "both"}, "cost_scope is 'both'"),
-        ({"normalize": "dict(norm_obs=True)"}, "normalize is"),
+        ({"normalize": "dict(norm_obs=True)"}, "normalize is .* expected true or false or a mapp"),
+        ({"oem_kwargs": None}, "oem_kwargs is empty, but e2c_t explores by observation entropy"),
         ({"seed": 3}, "seed is no hyperparameter; use the flag --seed"),
     ],
 )
 def test_a_wrong_hyperparameter_is_named(overrides, message):
     with pytest.raises(UserError, match=message):
         resolve("e2c_t", ENV, overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"multipliers_kwargs": {"lr": 1}}, "multipliers_kwargs 'lr'; known: .*learning_rate"),
+        ({"multipliers_class": "PIDMultipliers", "multipliers_kwargs": {"kpp": 1}}, "mean 'kp'"),
+        ({"multipliers_kwargs": {"shape": [1, 1]}}, "follows from cost_limits and cost_scope"),
+        ({"multipliers_kwargs": {"initial": "high"}}, "initial is 'high'; expected a number"),
+        ({"multipliers_class": "Multipliers"}, "did you mean 'PIDMultipliers'"),
+        ({"oem_kwargs": {"pssi": 1}}, "unknown key in oem_kwargs 'pssi'; did you mean 'psi'"),
+        ({"oem_kwargs": {"estimator": [1]}}, "oem_kwargs.estimator is .*; expected a name"),
+        ({"oem_kwargs": {"estimator_kwargs": {"quant": 1}}}, "did you mean 'quantization'"),
+        ({"oem_kwargs": {"estimator": "nearest_neighbor"}}, "estimator_kwargs.k is missing"),
+        ({"policy_kwargs": {"net_arhc": [8]}}, "did you mean 'net_arch'"),
+        ({"policy_kwargs": {"gru_hidden_size": 8}}, "unknown key in policy_kwargs 'gru_hidden_si"),
+        ({"policy_kwargs": {"n_agents": 3}}, "policy_kwargs.n_agents follows from the environment"),
+        ({"policy_kwargs": {"critic_lr_schedule": 1}}, "follows from critic_learning_rate"),
+        ({"policy_kwargs": {"use_sde": True}}, "policy_kwargs.use_sde follows from MAPPO without"),
+        ({"policy_kwargs": {"net_arch": [-3]}}, "policy_kwargs.net_arch is .* at least 1"),
+        ({"policy_kwargs": {"net_arch": "big"}}, "net_arch is 'big'; expected a list of whole num"),
+        ({"policy_kwargs": {"net_arch": [3.5]}}, "net_arch is .* expected a list of whole numbers"),
+        ({"policy_kwargs": {"net_arch": [{"pi": [3]}]}}, "net_arch is .* expected a list of whole"),
+        ({"policy_kwargs": {"optimizer_kwargs": 3}}, "expected a mapping or null"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"epps": 1}}}, "did you mean 'eps'"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"lr": 1}}}, "lr follows from learning_rate"),
+        ({"normalize": {"foo": 1}}, "unknown key in normalize 'foo'; known: clip_obs"),
+        ({"normalize": {"norm_obs": "maybe"}}, "norm_obs is 'maybe'; expected true or false"),
+        ({"normalize": {"gamma": 0.5}}, "normalize.gamma follows from gamma"),
+    ],
+)
+def test_a_wrong_argument_of_a_part_is_named(overrides, message):
+    with pytest.raises(UserError, match=message):
+        resolve("e2c_t", ENV, overrides=overrides)
+
+
+def test_arguments_of_the_named_class_are_accepted():
+    overrides = {
+        "policy": "GruPolicy",
+        "policy_kwargs": {
+            "gru_hidden_size": 8,
+            "net_arch": {"pi": [8], "vf": []},
+            "optimizer_kwargs": {"betas": [0.9, 0.99]},
+        },
+        "multipliers_kwargs": {"maximum": math.inf},
+        "oem_kwargs": {"estimator": "nearest_neighbor", "estimator_kwargs": {"k": 3}},
+        "normalize": {"norm_reward": False},
+    }
+    config = resolve("e2c_t", ENV, overrides=overrides)
+    assert config["oem_kwargs"]["estimator_kwargs"] == {"k": 3}
+
+
+def test_multipliers_that_a_module_exports_can_be_named():
+    class Mine(GradientMultipliers):
+        pass
+
+    module = SimpleNamespace(Mine=Mine, Multipliers=Multipliers, other=3)
+    assert classes_in(module, Multipliers) == {"Mine": Mine}
+    assert set(CLASSES["multipliers_class"]) == {"GradientMultipliers", "PIDMultipliers"}
+
+
+def test_expectations_are_plain_words():
+    constructed = [*(set(configuration.ALGORITHMS.values())), OEMRewardCallback, VecNormalize]
+    constructed += [each for key in ("policy", "estimator") for each in CLASSES[key].values()]
+    arguments = {**configuration.ZOO_KEYS}
+    for each in constructed:
+        arguments.update(arguments_of(each))
+    taken = ("env", "venv", "device", "observation_space", "action_space", "lr_schedule")
+    phrases = {arguments[key].in_words() for key in arguments if key not in taken}
+    assert "a number, a schedule such as lin_3e-4 or null" in phrases
+    assert "'team' or 'individual'" in phrases
+    assert [each for each in phrases if re.search(r"typing|class|\[|\|", each)] == []
 
 
 def test_a_key_of_another_method_is_refused_only_if_the_user_gave_it():
@@ -307,6 +392,14 @@ def test_continuing_goes_on_with_counters_and_configuration(copy):
     config = read_yaml(run / ENV / "config.yml")
     assert (config["n_envs"], config["n_epochs"]) == (2, 2)  # of the first run; of the user
     assert pd.read_csv(run / "progress.csv")["time/total_timesteps"].iloc[-1] == 3 * ROLLOUT
+
+
+def test_a_continued_run_may_change_the_critics_learning_rate(copy):
+    start = run_folder(copy) / f"{ENV}.zip"
+    argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(start), "--verbose", "0"]
+    run = train.train([*argv, "--eval-freq", "-1", "-params", "critic_learning_rate:7e-4"])
+    model = E2CMAPPO.load(run / f"{ENV}.zip", device="cpu")
+    assert model.policy.optimizer.param_groups[1]["lr"] == 7e-4
 
 
 def test_continuing_refuses_what_would_be_another_experiment(copy, capsys):
@@ -400,6 +493,29 @@ def test_hyperparameters_come_from_a_file_too(tmp_path):
     assert read_yaml(run / ENV / "config.yml")["gamma"] == 0.8
 
 
+def test_networks_with_a_memory_train_and_evaluate(tmp_path):
+    params = ["policy_kwargs.gru_hidden_size:8"]
+    run = run_train(tmp_path, "--preset", "gru", steps=ROLLOUT, params=params)
+    assert read_yaml(run / ENV / "config.yml")["policy"] == "GruPolicy"
+    assert run_enjoy(tmp_path) == run_enjoy(tmp_path)
+
+
+def test_the_gru_preset_keeps_the_networks_of_table_1():
+    assert resolve("e2c_t", ENV, ["gru"])["policy_kwargs"]["net_arch"] == {
+        "pi": [128, 128],
+        "vf": [128, 128],
+    }
+
+
+def test_a_training_that_blows_up_is_one_line_and_keeps_what_was_saved(tmp_path, capsys):
+    argv = ["--env", ENV, "-f", tmp_path, "-n", 4 * ROLLOUT, "--eval-freq", "-1", "--seed", "1"]
+    params = ["learning_rate:1e30", "critic_learning_rate:1e30", "n_envs:2"]
+    message = refusal(capsys, train.main, [*argv, "--device", "cpu", "-params", *params])
+    assert "training stopped: " in message
+    assert f"{run_folder(tmp_path)} keeps what was saved before" in message
+    assert (run_folder(tmp_path) / ENV / "config.yml").is_file()
+
+
 def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
     with pytest.raises(SystemExit) as exit_:
         train.main(["--help"])
@@ -407,6 +523,8 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
     text = capsys.readouterr().out
     assert "--preset" in text
     assert "--save-freq" in text
+    for flag in ("--n-trials", "-optimize", "--storage", "--save-replay-buffer"):
+        assert flag not in text
 
 
 @pytest.mark.parametrize(
@@ -418,7 +536,16 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
         (["-params", "gama:0.9"], "did you mean 'gamma'"),
         (["-params", "gamma:high"], "gamma is 'high'"),
         (["-params", "gamma"], "expected key:value"),
-        (["-params", "policy_kwargs.net_arhc:[8]"], "net_arhc"),
+        (["-params", "gamma:0.5", "gamma.x:3"], "found gamma.x:3, but gamma is 0.5 already"),
+        (["-params", "policy_kwargs.net_arhc:[8]"], "did you mean 'net_arch'"),
+        (["-params", "policy_kwargs.net_arch:dict(pii=[3])"], "expected 'pi', 'vf'"),
+        (["-params", "policy_kwargs.net_arch:[10000000,10000000]"], "can't allocate memory"),
+        (["-params", "policy_kwargs.activation_fn:GLU"], "shapes cannot be multiplied"),
+        (["-params", "policy_kwargs.optimizer_class:LBFGS"], "LBFGS doesn't support"),
+        (["-params", "normalize.norm_obs_keys:['a']"], "normalize: "),
+        (["-params", "n_envs:100000000000"], "100000000000 worlds would take at least"),
+        (["-params", "n_steps:10000000000"], "10000000000 steps of 60 agents would take"),
+        (["--n-eval-envs", "100000000000"], "100000000000 worlds would take at least"),
         (["-params", "policy_kwargs.activation_fn:RELU"], "did you mean 'ReLU'"),
         (["-params", "policy:MlpPolcy"], "did you mean 'MlpPolicy'"),
         (["-params", "batch_size:3"], "batch_size is 3, smaller than the team of 6"),
@@ -428,6 +555,8 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
         (["--env-kwargs", "max_cylces:10"], "did you mean 'max_cycles'"),
         (["--env-kwargs", "max_cycles:0"], "max_cycles is 0"),
         (["--eval-env-kwargs", "max_cycles:0"], "max_cycles is 0"),
+        (["--eval-env-kwargs", "n_rovers:8"], "agents of the evaluation would be"),
+        (["--eval-env-kwargs", "add_id:false"], "observation_space of the evaluation would be"),
         (["-n", "-5"], "--n-timesteps is -5"),
         (["-n", "many"], "invalid int value: 'many'"),
         (["--eval-episodes", "0"], "--eval-episodes is 0"),
@@ -435,10 +564,18 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
         (["--log-interval", "0"], "--log-interval is 0"),
         (["--seed", str(2**32)], "--seed is 4294967296"),
         (["--device", "gpu"], "--device is 'gpu'"),
+        (["--device", "meta"], "--device is 'meta'; expected auto, cpu, cuda"),
+        (["--device", "cuda:99"], "--device is 'cuda:99', but torch finds"),
+        (["-f", ""], "--log-folder is empty"),
+        (["-tb", "/proc/x"], "--tensorboard-log /proc/x: cannot write there"),
         (["--flag"], "unrecognized arguments: --flag"),
         (["-i", "missing.zip"], "-i missing.zip"),
         (["-conf", "missing.yml"], "cannot read missing.yml"),
         (["-optimize"], "-optimize"),
+        (["--n-trials", "3"], "--n-trials is not available for teams"),
+        (["--sampler", "random"], "--sampler is not available for teams"),
+        (["--save-replay-buffer"], "--save-replay-buffer is not available for teams"),
+        (["--truncate-last-trajectory", "False"], "--truncate-last-trajectory is not available"),
         (["--gym-packages", "no_such_package"], "no_such_package"),
     ],
 )
@@ -451,7 +588,24 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(tmp_path, capsys, flags
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
-    assert "cannot write there" in refusal(capsys, train.main, ["--env", ENV, "-f", file / "logs"])
+    for folder in (file / "logs", "/proc/x"):  # root may write to the second, and yet cannot
+        assert "cannot write there" in refusal(capsys, train.main, ["--env", ENV, "-f", folder])
+
+
+def test_a_gpu_must_be_there_to_be_asked_for(monkeypatch):
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
+    for device in ("auto", "cpu", "cuda", "cuda:0"):
+        check_device(device)
+    with pytest.raises(UserError, match="'cuda:1', but torch finds 1 such"):
+        check_device("cuda:1")
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 0)
+    with pytest.raises(UserError, match="'cuda', but torch finds 0 such"):
+        check_device("cuda")
+
+
+def test_seeing_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
+    check_writable(tmp_path / "new" / "folder", "--log-folder")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_continuing_from_a_broken_file_is_refused(tmp_path, capsys):
@@ -526,7 +680,7 @@ def test_no_pickle_of_the_model_file_is_executed(copy, tmp_path):
     poison = {":type:": "Payload", ":serialized:": payload}
     honest = run_enjoy(copy)
     model = run_folder(copy) / f"{ENV}.zip"
-    rewrite(model, "data", lambda text: json.dumps({**json.loads(text), "poison": poison}))
+    rewrite(model, "data", lambda old: json.dumps({**json.loads(old), "poison": poison}).encode())
     assert run_enjoy(copy) == honest
     assert not trace.exists()
     run_enjoy(copy, "--trust")
@@ -537,10 +691,46 @@ def rewrite(archive, name, change):
     """Change one member of a zip file."""
     with zipfile.ZipFile(archive) as file:
         members = {each: file.read(each) for each in file.namelist()}
-    members[name] = change(members[name].decode()).encode()
+    members[name] = change(members[name])
     with zipfile.ZipFile(archive, "w") as file:
         for each, content in members.items():
             file.writestr(each, content)
+
+
+def rewrite_weights(archive, name, change):
+    """Change what torch has saved in one member of a zip file."""
+
+    def changed(old):
+        file = io.BytesIO()
+        th.save(change(th.load(io.BytesIO(old))), file)
+        return file.getvalue()
+
+    rewrite(archive, name, changed)
+
+
+ACTOR = "mlp_extractor.policy_net.0.weight"
+
+
+@pytest.mark.parametrize(
+    ("member", "change", "message"),
+    [
+        ("policy.pth", lambda old: [1, 2], "does not fit"),
+        ("policy.pth", lambda old: {**old, ACTOR: "text"}, "does not fit"),
+        ("policy.pth", lambda old: {**old, ACTOR: old[ACTOR][:1]}, "does not fit"),
+        ("policy.pth", lambda old: {**old, ACTOR: old[ACTOR] * math.nan}, f"spoiled: {ACTOR} has"),
+        ("policy.pth", lambda old: Payload("trace"), "holds something else than numbers"),
+        ("policy.optimizer.pth", lambda old: "text", "does not fit"),
+        ("policy.optimizer.pth", lambda old: {"state": 3, "param_groups": 4}, "does not fit"),
+        ("multipliers.pth", lambda old: 3.0, "does not fit"),
+        ("multipliers.pth", lambda old: {"values": old["values"] + math.inf}, "multipliers.values"),
+    ],
+)
+def test_a_foreign_or_spoiled_model_is_one_short_line(copy, capsys, member, change, message):
+    rewrite_weights(run_folder(copy) / f"{ENV}.zip", member, change)
+    line = refusal(capsys, enjoy.main, ["--env", ENV, "-f", copy, "--device", "cpu"])
+    assert message in line
+    assert "weights_only" not in line
+    assert len(line) < 600
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
@@ -562,17 +752,31 @@ def test_enjoy_films_one_episode(trained, tmp_path, suffix):
         (["--n-episodes", "0"], "--n-episodes is 0"),
         (["--n-envs", "-1"], "--n-envs is -1"),
         (["--seed", "-1"], "--seed is -1"),
-        (["--deterministic", "--stochastic"], "exclude each other"),
+        (["--n-envs", "100000000000"], "100000000000 worlds would take at least"),
+        (["--deterministic", "--stochastic"], "not allowed with argument --deterministic"),
+        (["--load-best", "--load-last-checkpoint"], "not allowed with argument --load-best"),
+        (["--load-best", "--load-checkpoint", "7"], "not allowed with argument --load-best"),
         (["--video", "film.txt"], ".gif or .mp4"),
         (["--json", "/dev/null/out.json"], "cannot write there"),
         (["--env-kwargs", "max_cylces:10"], "did you mean 'max_cycles'"),
         (["--env-kwargs", "n_rovers:8"], "does not fit"),
         (["--device", "gpu"], "--device is 'gpu'"),
+        (["--device", "cuda:99"], "--device is 'cuda:99', but torch finds"),
     ],
 )
 def test_a_mistake_in_enjoy_is_one_line(trained, capsys, flags, message):
     argv = ["--env", ENV, "-f", trained, "--device", "cpu", "--n-episodes", "1", *flags]
     assert message in refusal(capsys, enjoy.main, argv)
+
+
+@pytest.mark.parametrize(("flag", "name"), [("--json", "results"), ("--video", "film.gif")])
+def test_a_folder_in_the_place_of_a_result_is_refused_before_any_work(
+    trained, tmp_path, capsys, monkeypatch, flag, name
+):
+    monkeypatch.setattr(enjoy, "find_run", None)
+    (tmp_path / name).mkdir()
+    argv = ["--env", ENV, "-f", trained, flag, tmp_path / name]
+    assert f"{flag} {tmp_path / name} is a folder" in refusal(capsys, enjoy.main, argv)
 
 
 def test_a_missing_folder_is_one_line(tmp_path, capsys):
@@ -614,6 +818,11 @@ def test_the_plot_is_a_picture_in_the_run_folder(copy):
     picture = plot_learning(run_folder(copy))
     assert picture == run_folder(copy) / "learning.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plotting_into_a_folder_is_one_line(trained, tmp_path, capsys):
+    argv = ["plots", run_folder(trained), "-o", tmp_path]
+    assert f"--out {tmp_path} is a folder" in refusal(capsys, cli.main, argv)
 
 
 def test_plotting_something_else_is_one_line(tmp_path, capsys):

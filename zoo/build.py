@@ -1,39 +1,45 @@
 """From names and numbers to objects: worlds, models, and their weights."""
 
+import contextlib
+import math
+import os
 import pickle
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_e2c import MAPPO, GradientMultipliers, PIDMultipliers, share_parameters
+from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.vec_env import MultiAgentVecEnv
-from sb3_e2c.zoo.console import UserError, unknown
-from sb3_e2c.zoo.hyperparams import ALGORITHMS, ZOO_KEYS
+from sb3_e2c.zoo.configuration import ALGORITHMS, ZOO_KEYS
+from sb3_e2c.zoo.console import UserError, brief
+from sb3_e2c.zoo.parts import CLASSES, class_named
+from sb3_e2c.zoo.signatures import schedule_start
 
-_MULTIPLIERS = {each.__name__: each for each in (GradientMultipliers, PIDMultipliers)}
-_NETWORK_NAMES = {  # key of policy_kwargs: where its name is looked up, what it must be
-    "activation_fn": (th.nn, th.nn.Module),
-    "optimizer_class": (th.optim, th.optim.Optimizer),
-}
-_BROKEN_FILE = (
-    ValueError,
-    RuntimeError,
-    KeyError,
-    EOFError,
-    OSError,
-    zipfile.BadZipFile,
-    zlib.error,
-    pickle.UnpicklingError,
-)
+_KEPT_NAMES = ("policy", "estimator")  # the library looks them up itself
+# What constructors raise for arguments that they cannot take
+_REFUSALS = (TypeError, ValueError, AssertionError, RuntimeError, MemoryError, OverflowError)
+
+
+@contextlib.contextmanager
+def refusals_of(name: str) -> Iterator[None]:
+    """Turn what a constructor refuses into a :class:`UserError`.
+
+    :param name: What is made
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except _REFUSALS as error:
+        raise UserError(f"{name}: {brief(error)}") from error
 
 
 def make_worlds(
@@ -53,41 +59,52 @@ def make_worlds(
     :raises UserError: for arguments that the environment refuses
     """
     make_env = partial(ENV_IDS[env_id], **(env_kwargs or {}))
-    try:
+    with refusals_of(env_id):
+        with contextlib.closing(make_env()) as env:
+            agents = env.possible_agents
+            size = len(agents) * spaces.flatdim(env.observation_space(agents[0]))
+        _check_memory(f"{n_worlds} worlds", n_worlds * size)
         return share_parameters(make_env, n_worlds, n_processes, seed=seed)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{env_id}: {error}") from error
+
+
+def _check_memory(what: str, n_floats: int) -> None:
+    """Refuse what cannot fit, since asking for too much memory can end the whole process."""
+    needed, memory = 4 * n_floats, _memory()
+    if needed > memory:
+        raise UserError(
+            f"{what} would take at least {needed / 2**30:.4g} GiB, more than this machine's memory "
+            f"of {memory / 2**30:.4g} GiB; choose fewer"
+        )
+
+
+def _memory() -> float:
+    """Bytes of memory of this machine, infinite where it does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):
+        return math.inf
 
 
 def constructor_arguments(config: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of the algorithm in a configuration, names replaced by what they name.
 
-    :param config: See :func:`sb3_e2c.zoo.hyperparams.resolve`
+    :param config: See :func:`sb3_e2c.zoo.configuration.resolve`
     :raises UserError: for a name without a meaning
     """
-    arguments = {key: value for key, value in config.items() if key not in ZOO_KEYS}
-    for key, value in arguments.items():
-        if isinstance(value, str) and value.startswith("lin_"):
-            arguments[key] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
-    if "policy_kwargs" in arguments:
-        arguments["policy_kwargs"] = _named_parts(arguments["policy_kwargs"] or {})
-    name = arguments.get("multipliers_class")
-    if name is not None:
-        if name not in _MULTIPLIERS:
-            raise unknown("multipliers_class", name, _MULTIPLIERS)
-        arguments["multipliers_class"] = _MULTIPLIERS[name]
-    return arguments
+    return _with_classes({key: value for key, value in config.items() if key not in ZOO_KEYS})
 
 
-def _named_parts(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of the policy with ``ReLU`` and ``Adam`` looked up in torch, and nowhere else."""
-    result = dict(policy_kwargs)
-    for key, (module, kind) in _NETWORK_NAMES.items():
-        if key in result:
-            found = getattr(module, str(result[key]), None)
-            if not (isinstance(found, type) and issubclass(found, kind)):
-                raise unknown(f"policy_kwargs.{key}", result[key], dir(module))
-            result[key] = found
+def _with_classes(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A mapping with classes and schedules instead of their names, however deep."""
+    result = dict(values)
+    for key, value in values.items():
+        start = schedule_start(value)
+        if start is not None:
+            result[key] = LinearSchedule(start, 0.0, 1.0)
+        elif isinstance(value, Mapping):
+            result[key] = _with_classes(value)
+        elif key in CLASSES and key not in _KEPT_NAMES:
+            result[key] = class_named(key, value)
     return result
 
 
@@ -95,18 +112,17 @@ def build_model(algo: str, config: Mapping[str, Any], env: VecEnv, **flags: Any)
     """An untrained model.
 
     :param algo: A key of ``ALGORITHMS``
-    :param config: See :func:`sb3_e2c.zoo.hyperparams.resolve`
+    :param config: See :func:`sb3_e2c.zoo.configuration.resolve`
     :param env: Its environment
     :param flags: ``seed``, ``device``, ``verbose``, ``tensorboard_log``
     :raises UserError: for values that the algorithm refuses
     """
     arguments = constructor_arguments(config)
-    if arguments["policy"] not in ALGORITHMS[algo].policy_aliases:
-        raise unknown("policy", arguments["policy"], ALGORITHMS[algo].policy_aliases)
-    try:
+    row = spaces.flatdim(env.observation_space) + spaces.flatdim(env.action_space)
+    n_steps = arguments["n_steps"]
+    _check_memory(f"{n_steps} steps of {env.num_envs} agents", n_steps * env.num_envs * row)
+    with refusals_of(algo):
         return ALGORITHMS[algo](env=env, **arguments, **flags)
-    except (TypeError, ValueError, AssertionError) as error:
-        raise UserError(f"{algo}: {error}") from error
 
 
 def load_weights(model: MAPPO, path: str | Path) -> None:
@@ -118,11 +134,29 @@ def load_weights(model: MAPPO, path: str | Path) -> None:
     """
     try:
         _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
-    except _BROKEN_FILE as error:
-        raise UserError(f"{path} is no readable model: {error}") from error
+    except pickle.UnpicklingError as error:  # torch's advice would be to execute it
+        raise UserError(
+            f"{path} is no readable model: it holds something else than numbers, or is damaged"
+        ) from error
+    except Exception as error:  # whatever zip files and torch raise for broken content
+        raise UserError(f"{path} is no readable model: {brief(error)}") from error
     try:
         model.set_parameters(weights, exact_match=True, device=model.device)
-    except _BROKEN_FILE as error:
+    except Exception as error:  # a state dictionary may hold anything
         raise UserError(
-            f"{path} does not fit; was it trained with another algorithm or environment? {error}"
+            f"{path} does not fit; was it trained with another algorithm or environment? "
+            f"{brief(error)}"
         ) from error
+
+
+def check_finite(model: MAPPO, path: str | Path) -> None:
+    """Refuse weights that are no numbers.
+
+    :param model: A loaded model
+    :param path: Where it comes from
+    :raises UserError: naming the first array with an infinite number or NaN
+    """
+    weights = {**model.policy.state_dict(), "multipliers.values": model.multipliers.values}
+    for name, tensor in weights.items():
+        if not th.isfinite(tensor).all():
+            raise UserError(f"{path} is spoiled: {name} has numbers that are infinite or NaN")

@@ -3,8 +3,10 @@
 import argparse
 import ast
 import difflib
-import os
+import re
 import sys
+import tempfile
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,8 +33,16 @@ def unknown(what: str, name: str, known: Iterable[str]) -> UserError:
     names = sorted(known)
     close = [each for each in names if each.lower() == str(name).lower()]
     close = close or difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {brief(', '.join(names))}"
     return UserError(f"unknown {what} {name!r}; {hint}")
+
+
+def brief(text: object) -> str:
+    """Another library's message, or a list, as a part of our one line.
+
+    :param text: What may have many lines
+    """
+    return textwrap.shorten(str(text), 300, placeholder=" ...")
 
 
 def fail(error: object) -> NoReturn:
@@ -43,10 +53,10 @@ def fail(error: object) -> NoReturn:
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turn a :class:`UserError` into one line and exit status 2."""
+    """Turn a :class:`UserError`, or a disk that refuses, into one line and exit status 2."""
     try:
         yield
-    except UserError as error:
+    except (UserError, OSError) as error:
         fail(error)
 
 
@@ -78,6 +88,10 @@ class StoreDict(argparse.Action):
             inner = result
             for name in outer:
                 inner = inner.setdefault(name, {})
+                if not isinstance(inner, dict):
+                    parser.error(
+                        f"argument {option_string}: found {pair}, but {name} is {inner!r} already"
+                    )
             inner[last] = parse_value(text)
         setattr(namespace, self.dest, result)
 
@@ -114,26 +128,46 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
 
 
 def check_device(device: str) -> None:
-    """Raise :class:`UserError` for a device that torch does not know.
+    """Raise :class:`UserError` for a device that this machine has not.
 
     :param device: For instance "auto", "cpu", "cuda:0"
     """
-    try:
-        th.device("cpu" if device == "auto" else device)
-    except RuntimeError:
-        raise UserError(f"--device is {device!r}; expected auto, cpu, cuda or cuda:0") from None
+    if re.fullmatch(r"auto|cpu|mps|cuda(:\d+)?", device) is None:
+        raise UserError(f"--device is {device!r}; expected auto, cpu, cuda, cuda:0 or mps")
+    kind, _, number = device.partition(":")
+    found = {"cuda": th.cuda.device_count(), "mps": int(th.backends.mps.is_available())}
+    if int(number or 0) >= found.get(kind, 1):
+        raise UserError(f"--device is {device!r}, but torch finds {found[kind]} such GPUs; use cpu")
 
 
 def check_writable(folder: str | Path, flag: str) -> None:
     """Raise :class:`UserError` unless the folder exists, or can be made, and can be written.
 
+    Permissions do not say it all (root, read-only and special file systems): we try.
+
     :param folder: The folder
     :param flag: The flag that named it
     """
-    existing = Path(folder).absolute()
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
-    if not (existing.is_dir() and os.access(existing, os.W_OK)):
-        raise UserError(
-            f"{flag} {folder}: cannot write there ({existing} is not a writable folder)"
-        )
+    if not str(folder):
+        raise UserError(f"{flag} is empty; expected the name of a folder")
+    try:
+        existing = Path(folder).absolute()
+        while not existing.exists():
+            existing = existing.parent
+        with tempfile.TemporaryDirectory(dir=existing):
+            pass
+    except OSError as error:
+        raise UserError(f"{flag} {folder}: cannot write there ({error.strerror})") from None
+
+
+def check_file(path: Path | None, flag: str) -> None:
+    """Raise :class:`UserError` unless a file of that name can be written.
+
+    :param path: The file, if one is asked for
+    :param flag: The flag that named it
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise UserError(f"{flag} {path} is a folder; expected the name of a file")
+    check_writable(path.parent, flag)

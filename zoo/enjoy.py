@@ -18,16 +18,16 @@ from tqdm.auto import tqdm
 
 from sb3_e2c import MAPPO, evaluate_team
 from sb3_e2c.evaluation import TeamEvaluation
+from sb3_e2c.zoo.configuration import ALGORITHMS, team_limits
 from sb3_e2c.zoo.console import (
     ConsoleParser,
     StoreDict,
     UserError,
     check_device,
-    check_writable,
+    check_file,
     one_line_errors,
     write_whole,
 )
-from sb3_e2c.zoo.hyperparams import ALGORITHMS, team_limits
 from sb3_e2c.zoo.runs import Run, find_run, load_model, make_env, record_episode
 
 
@@ -39,13 +39,15 @@ def make_parser() -> ConsoleParser:
     add("--env", default="MultiRover-6-3-v0", help="environment ID")
     add("-f", "--folder", default="logs", help="log folder (default: logs)")
     add("--exp-id", type=int, default=0, help="number of the run (default: the latest)")
-    add("--load-best", action=switch, help="load the best model instead of the last")
-    add("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
-    add("--load-last-checkpoint", action=switch, help="load the last checkpoint")
+    which = parser.add_mutually_exclusive_group().add_argument
+    which("--load-best", action=switch, help="load the best model instead of the last")
+    which("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
+    which("--load-last-checkpoint", action=switch, help="load the last checkpoint")
     add("--n-episodes", type=int, default=100, help="episodes of the team (default: 100)")
     add("--n-envs", type=int, default=10, help="worlds at a time (default: 10)")
-    add("--deterministic", action=switch, help="take the most likely actions")
-    add(
+    how = parser.add_mutually_exclusive_group().add_argument
+    how("--deterministic", action=switch, help="take the most likely actions")
+    how(
         "--stochastic",
         action=switch,
         help="sample actions (the default: the limits were trained for the sampled policy)",
@@ -58,7 +60,13 @@ def make_parser() -> ConsoleParser:
         action=switch,
         help="accepted as RL-Zoo's flag: there is never a window; see --video",
     )
-    add("--json", type=Path, metavar="FILE", help="write the results to FILE")
+    add(
+        "--json",
+        type=Path,
+        metavar="FILE",
+        help="write the results to FILE; cost_limits is a list, other numbers of a constraint are "
+        "lists only if there are several constraints",
+    )
     add("--video", type=Path, metavar="FILE", help="film one episode (.gif or .mp4)")
     add("--trust", action=switch, help="unpickle the model: it can then execute code")
     add("-P", "--progress", action=switch, help="progress bar")
@@ -73,18 +81,18 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"{flag} is {getattr(args, name)}; expected at least 1")
     if not 0 <= args.seed < 2**32:
         raise UserError(f"--seed is {args.seed}; expected a number from 0 to 2**32 - 1")
-    if args.deterministic and args.stochastic:
-        raise UserError("--deterministic and --stochastic exclude each other; give one of them")
     check_device(args.device)
     for flag, path in (("--json", args.json), ("--video", args.video)):
-        if path is not None:
-            check_writable(path.parent, flag)
+        check_file(path, flag)
     if args.video is not None and args.video.suffix not in (".gif", ".mp4"):
         raise UserError(f"--video is {args.video}; expected a name that ends in .gif or .mp4")
 
 
 def summarize(run: Run, model: MAPPO, result: TeamEvaluation, **settings: Any) -> dict[str, Any]:
     """What ``--json`` writes: means over episodes with their standard errors (``_se``).
+
+    ``team_cost``, its error and ``lambda`` are numbers with one constraint, lists with several and
+    None without any; ``cost_limits`` is always a list.
 
     :param run: The run
     :param model: Its model

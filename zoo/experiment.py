@@ -11,7 +11,6 @@ from pprint import pprint
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS, get_callback_list
@@ -29,15 +28,29 @@ from sb3_e2c import MAPPO, TeamEvalCallback
 from sb3_e2c.constraints import check_n_costs, read_costs
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.monitor import TeamMonitor
-from sb3_e2c.zoo.build import build_model, constructor_arguments, make_worlds
-from sb3_e2c.zoo.console import UserError, write_whole
-from sb3_e2c.zoo.hyperparams import ALGORITHMS, merge, parse_presets, read_yaml, resolve
+from sb3_e2c.zoo.build import (
+    build_model,
+    check_finite,
+    constructor_arguments,
+    make_worlds,
+    refusals_of,
+)
+from sb3_e2c.zoo.configuration import (
+    ALGORITHMS,
+    ZOO_KEYS,
+    merge,
+    parse_presets,
+    read_yaml,
+    resolve,
+)
+from sb3_e2c.zoo.console import UserError, brief, write_whole
 from sb3_e2c.zoo.normalization import load_statistics, save_statistics, statistics_path
 
 # What a continued run may change: numbers that a loaded model reads anew in each rollout.
 _CHANGEABLE = (
-    *("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "vf_coef", "max_grad_norm"),
-    *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "reward_scale"),
+    *("learning_rate", "critic_learning_rate", "clip_range", "clip_range_vf"),
+    *("ent_coef", "vf_coef", "max_grad_norm", "n_steps"),
+    *("batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "reward_scale"),
 )
 
 
@@ -53,7 +66,7 @@ def register() -> None:
             gym.register(env_id, entry_point=_no_single_agent)
 
 
-def configuration(args: Namespace) -> dict[str, Any]:
+def configure(args: Namespace) -> dict[str, Any]:
     """The configuration that a ``train`` command line asks for.
 
     :param args: Parsed flags of ``train``
@@ -91,12 +104,22 @@ def _continued_configuration(args: Namespace) -> dict[str, Any] | None:
 
 
 def _check_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
-    ours = set(new) - {"n_envs", "n_timesteps", "env_kwargs", "normalize", "callback"}
-    for key in sorted(ours - set(_CHANGEABLE)):
+    for key in sorted(set(new) - ZOO_KEYS.keys() - set(_CHANGEABLE)):
         if new[key] != old.get(key):
             raise UserError(
                 f"{key} was {old.get(key)!r} in the run to be continued (-i) and cannot become "
                 f"{new[key]!r}; start a new run"
+            )
+
+
+def _check_same_team(env: VecEnv, eval_env: VecEnv) -> None:
+    """Refuse an evaluation of the team in an environment for another one."""
+    for name in ("agents", "observation_space", "action_space"):
+        found, expected = getattr(eval_env, name), getattr(env, name)
+        if found != expected:
+            raise UserError(
+                f"--eval-env-kwargs: {name} of the evaluation would be {found}, but the team "
+                f"trains with {expected}; change only what leaves them alike"
             )
 
 
@@ -120,7 +143,7 @@ class TeamExperimentManager(ExperimentManager):
 
         :return: The model, and the configuration of the run
         """
-        config = configuration(self.args)
+        config = configure(self.args)
         self.n_envs = config["n_envs"]
         self.n_timesteps = self.n_timesteps if self.n_timesteps > 0 else config["n_timesteps"]
         self.env_kwargs = config.get("env_kwargs") or {}
@@ -145,26 +168,23 @@ class TeamExperimentManager(ExperimentManager):
         """Build worlds and model once without a trace, so that mistakes show before the run."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they will be seen in earnest
-            with contextlib.closing(self.create_envs(self.n_eval_envs, eval_env=True)) as env:
-                env.reset()
             with contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env:
+                with contextlib.closing(self.create_envs(self.n_eval_envs, True)) as eval_env:
+                    eval_env.reset()
+                    _check_same_team(env, eval_env)
                 self.n_slots = env.num_envs
                 self._step_once(self._make_model(config, env, verbose=0))
 
-    @staticmethod
-    def _step_once(model: MAPPO) -> None:
-        """See whether the environment reports the costs that are limited."""
+    def _step_once(self, model: MAPPO) -> None:
+        """See whether the actor acts, and the environment reports the costs that are limited."""
         env = model.env
         assert env is not None
-        env.reset()
-        actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
-        try:
+        with refusals_of(f"{self.algo} on {self.env_id}"):
+            actions, _ = model.predict(env.reset())  # type: ignore[arg-type]
             infos = env.step(actions)[-1]
             if len(model.cost_limits):
                 costs = read_costs(infos, model.agents)
                 check_n_costs(costs, len(model.cost_limits), model.agents)
-        except ValueError as error:
-            raise UserError(str(error)) from error
 
     def _make_model(self, config: dict[str, Any], env: VecEnv, verbose: int) -> MAPPO:
         flags: dict[str, Any] = {"seed": self.seed, "device": self.device, "verbose": verbose}
@@ -172,9 +192,11 @@ class TeamExperimentManager(ExperimentManager):
             return build_model(self.algo, config, env, **flags)
         changes = constructor_arguments({k: config[k] for k in _CHANGEABLE if k in config})
         try:
-            return ALGORITHMS[self.algo].load(self.trained_agent, env=env, **flags, **changes)
+            model = ALGORITHMS[self.algo].load(self.trained_agent, env=env, **flags, **changes)
         except Exception as error:  # whatever a broken or foreign pickle may raise
-            raise UserError(f"cannot continue from {self.trained_agent}: {error}") from error
+            raise UserError(f"cannot continue from {self.trained_agent}: {brief(error)}") from error
+        check_finite(model, self.trained_agent)
+        return model
 
     def _describe(self, config: dict[str, Any]) -> None:
         n_agents = self.n_slots // self.n_envs
@@ -208,7 +230,8 @@ class TeamExperimentManager(ExperimentManager):
         if self.continue_training:
             env = load_statistics(env, statistics_path(self.trained_agent))
         else:
-            env = VecNormalize(env, **self.normalize_kwargs)
+            with refusals_of("normalize"):
+                env = VecNormalize(env, **self.normalize_kwargs)
         if eval_env:
             env.training = env.norm_reward = False
         return env
@@ -244,6 +267,7 @@ class TeamExperimentManager(ExperimentManager):
         """Train; a continued run keeps its step counter and ends ``n_timesteps`` later.
 
         :param model: What :meth:`setup_experiment` built
+        :raises UserError: if it breaks off, for instance because its numbers blow up
         """
         model.set_logger(self._logger())
         log_interval = {-1: 1, -2: None}.get(self.log_interval, self.log_interval)
@@ -256,6 +280,10 @@ class TeamExperimentManager(ExperimentManager):
             )
         except KeyboardInterrupt:
             print("Interrupted: saving what has been learned")
+        except (ValueError, RuntimeError, MemoryError) as error:
+            raise UserError(
+                f"training stopped: {brief(error)}; {self.save_path} keeps what was saved before"
+            ) from error
         finally:
             self._release(model)
 

@@ -12,8 +12,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_e2c.zoo.console import ConsoleParser, UserError, one_line_errors, write_whole
-from sb3_e2c.zoo.hyperparams import read_yaml, team_limits
+from sb3_e2c.zoo.configuration import read_yaml, team_limits
+from sb3_e2c.zoo.console import (
+    ConsoleParser,
+    UserError,
+    check_file,
+    one_line_errors,
+    write_whole,
+)
 
 WINDOW = 100  # episodes, as in the paper's figures
 _BLUE, _RED, _GREEN = "#1f6f9f", "#b5403a", "#3a7d44"
@@ -28,6 +34,8 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
     :raises UserError: if the folder is no run, or no episode of it has finished
     """
     folder = Path(run_folder)
+    out = folder / "learning.png" if out is None else Path(out)
+    check_file(out, "--out")
     args, config = _settings(folder)
     progress = _read(folder / "progress.csv")
     episodes = _read(folder / "monitor.csv", comment="#")
@@ -49,7 +57,6 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
         _tidy(axes)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
-    out = folder / "learning.png" if out is None else Path(out)
     write_whole(out, picture.getvalue())
     return out
 

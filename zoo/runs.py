@@ -14,9 +14,9 @@ from rl_zoo3.utils import get_model_path
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import MAPPO
-from sb3_e2c.zoo.build import build_model, load_weights, make_worlds
-from sb3_e2c.zoo.console import UserError, write_whole
-from sb3_e2c.zoo.hyperparams import ALGORITHMS, check, check_algo, check_env, merge, read_yaml
+from sb3_e2c.zoo.build import build_model, check_finite, load_weights, make_worlds
+from sb3_e2c.zoo.configuration import ALGORITHMS, check, check_algo, check_env, merge, read_yaml
+from sb3_e2c.zoo.console import UserError, brief, write_whole
 from sb3_e2c.zoo.normalization import load_statistics, statistics_path
 
 
@@ -28,7 +28,7 @@ class Run:
     :param env_id: Its environment
     :param folder: The run's folder
     :param model_path: The model's zip file
-    :param config: What it was trained with, see :func:`sb3_e2c.zoo.hyperparams.resolve`
+    :param config: What it was trained with, see :func:`sb3_e2c.zoo.configuration.resolve`
     """
 
     algo: str
@@ -119,11 +119,17 @@ def load_model(
     if not trust:
         model = build_model(run.algo, run.config, env, seed=seed, device=device)
         load_weights(model, run.model_path)
-        return model
+    else:
+        model = _unpickle(run, env, seed=seed, device=device)
+    check_finite(model, run.model_path)
+    return model
+
+
+def _unpickle(run: Run, env: VecEnv, **flags: Any) -> MAPPO:
     try:
-        return ALGORITHMS[run.algo].load(run.model_path, env=env, seed=seed, device=device)
+        return ALGORITHMS[run.algo].load(run.model_path, env=env, **flags)
     except Exception as error:  # whatever a broken or foreign pickle may raise
-        raise UserError(f"cannot load {run.model_path}: {error}") from error
+        raise UserError(f"cannot load {run.model_path}: {brief(error)}") from error
 
 
 def record_episode(model: MAPPO, env: VecEnv, path: Path, deterministic: bool) -> None:

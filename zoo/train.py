@@ -18,6 +18,13 @@ from typing import Any
 
 import rl_zoo3.train
 
+from sb3_e2c.zoo.configuration import (
+    ALGORITHMS,
+    check_algo,
+    check_env,
+    parse_presets,
+    preset_names,
+)
 from sb3_e2c.zoo.console import (
     ConsoleParser,
     StoreDict,
@@ -26,14 +33,7 @@ from sb3_e2c.zoo.console import (
     check_writable,
     one_line_errors,
 )
-from sb3_e2c.zoo.experiment import TeamExperimentManager, configuration, register
-from sb3_e2c.zoo.hyperparams import (
-    ALGORITHMS,
-    check_algo,
-    check_env,
-    parse_presets,
-    preset_names,
-)
+from sb3_e2c.zoo.experiment import TeamExperimentManager, configure, register
 
 _PAIRS = {"action": StoreDict, "metavar": "KEY:VALUE"}
 # RL-Zoo's flags that mean something else here, or read their values as data instead of code
@@ -63,6 +63,13 @@ _CHANGED_FLAGS: dict[str, dict[str, Any]] = {
     "--env-kwargs": _PAIRS,
     "--eval-env-kwargs": _PAIRS,
 }
+# RL-Zoo's search for hyperparameters and its replay buffers are not for teams.
+_NOT_FOR_TEAMS = {
+    *("--n-trials", "--max-total-trials", "--sampler", "--pruner", "--storage", "--study-name"),
+    *("--trial-id", "--n-jobs", "--n-startup-trials", "--n-evaluations", "--no-optim-plots"),
+    *("--optimization-log-path", "--optimize-hyperparameters"),
+    *("--save-replay-buffer", "--truncate-last-trajectory"),
+}
 _AT_LEAST = {
     "eval_episodes": 1,
     "n_eval_envs": 1,
@@ -85,6 +92,9 @@ class TrainParser(ConsoleParser):
         """Add a flag of RL-Zoo's, changed where ours differ."""
         for name in names:
             kwargs.update(_CHANGED_FLAGS.get(name, {}))
+        if _NOT_FOR_TEAMS.intersection(names):
+            kwargs = {"action": _Refuse, "nargs": "*", "default": kwargs.get("default")}
+            kwargs["help"] = argparse.SUPPRESS
         return super().add_argument(*names, **kwargs)
 
     def parse_args(self, *_: Any, **__: Any) -> Any:
@@ -101,6 +111,15 @@ class TrainParser(ConsoleParser):
         return args
 
 
+class _Refuse(argparse.Action):
+    """A flag of RL-Zoo's that would do nothing."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Report the flag as a mistake."""
+        flags = "/".join(self.option_strings)
+        parser.error(f"{flags} is not available for teams: no search, no replay buffer")
+
+
 class _Raw(argparse.RawDescriptionHelpFormatter):
     """Keeps the paragraphs of the description."""
 
@@ -113,17 +132,15 @@ def _check(args: argparse.Namespace) -> None:
     check_env(args.env)
     parse_presets(args.preset)
     _check_numbers(args)
-    if args.optimize_hyperparameters:
-        raise UserError("-optimize: the search for hyperparameters is not available for teams")
     check_device(args.device)
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UserError("--track needs Weights & Biases: pip install wandb")
     check_writable(args.log_folder, "--log-folder")
-    if args.tensorboard_log:
+    if args.tensorboard_log:  # "" is RL-Zoo's word for none
         check_writable(args.tensorboard_log, "--tensorboard-log")
     if args.trained_agent and not zipfile.is_zipfile(args.trained_agent):
         raise UserError(f"-i {args.trained_agent}: expected the .zip file of a saved model")
-    configuration(args)
+    configure(args)
 
 
 def _import_packages(names: Sequence[str]) -> None:

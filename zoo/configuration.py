@@ -5,22 +5,21 @@ the presets, a ``--conf-file`` and ``-params``; later ones win and mappings merg
 arguments of the algorithm's constructor, and ``ZOO_KEYS``. YAML is data: nothing in it is executed.
 """
 
-import inspect
 import math
 import re
-import types
-import typing
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import yaml
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_e2c import E2CMAPPO, MAPPO
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.zoo.console import UserError, unknown
+from sb3_e2c.zoo.parts import CLASSES, PARTS, class_named
+from sb3_e2c.zoo.signatures import Argument, arguments_of, numbers_in
 
 ALGORITHMS: dict[str, type[MAPPO]] = {
     "mappo": MAPPO,
@@ -29,26 +28,28 @@ ALGORITHMS: dict[str, type[MAPPO]] = {
     "e2c": E2CMAPPO,
     "e2c_t": E2CMAPPO,
 }
-ZOO_KEYS = ("n_envs", "n_timesteps", "env_kwargs", "normalize", "callback")
+ZOO_KEYS: dict[str, Argument] = {
+    "n_envs": Argument(int),
+    "n_timesteps": Argument(int),
+    "env_kwargs": Argument(dict | None),
+    "normalize": Argument(bool | dict),
+    "callback": Argument(str | list | dict | None),
+}
 FLAGS = ("env", "seed", "device", "verbose", "tensorboard_log")
 FOLDER = Path(__file__).parent / "hyperparams"
 
 # Naming another class drops the arguments of the old one.
 _OWN_ARGUMENTS = {"estimator": "estimator_kwargs", "multipliers_class": "multipliers_kwargs"}
-_COUNT, _SHARE, _AMOUNT = (1, math.inf), (0, 1), (0, math.inf)
+# Numbers by their key, wherever it stands
+_COUNT, _SHARE, _AMOUNT = (1, sys.maxsize), (0, 1), (0, math.inf)
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("n_envs", "n_timesteps", "n_steps", "batch_size", "n_epochs"), _COUNT),
+    **dict.fromkeys(("stats_window_size", "net_arch", "gru_hidden_size"), _COUNT),
     **dict.fromkeys(("gamma", "gae_lambda", "cost_gamma"), _SHARE),
     **dict.fromkeys(("learning_rate", "critic_learning_rate", "clip_range"), _AMOUNT),
+    **dict.fromkeys(("clip_range_vf", "clip_obs", "clip_reward", "epsilon"), _AMOUNT),
     **dict.fromkeys(("ent_coef", "vf_coef", "max_grad_norm", "target_kl"), _AMOUNT),
-    **dict.fromkeys(("cost_limits", "reward_scale", "stats_window_size"), _AMOUNT),
-}
-_ZOO_TYPES: dict[str, Any] = {
-    "n_envs": int,
-    "n_timesteps": int,
-    "env_kwargs": dict | None,
-    "normalize": bool | dict,
-    "callback": str | list | dict | None,
+    **dict.fromkeys(("cost_limits", "reward_scale"), _AMOUNT),
 }
 
 
@@ -181,14 +182,14 @@ def resolve(
     return dict(sorted(config.items()))
 
 
-def keys(algo: str) -> dict[str, Any]:
-    """Everything that a configuration may hold, with its type.
+def keys(algo: str) -> dict[str, Argument]:
+    """Everything that a configuration may hold.
 
     :param algo: A key of ``ALGORITHMS``
     """
-    arguments = _constructor_types(ALGORITHMS[algo])
+    arguments = arguments_of(ALGORITHMS[algo])
     no_numbers = (*FLAGS, "_init_setup_model")
-    return {key: arguments[key] for key in arguments if key not in no_numbers} | _ZOO_TYPES
+    return {key: arguments[key] for key in arguments if key not in no_numbers} | ZOO_KEYS
 
 
 def check(algo: str, config: Mapping[str, Any]) -> None:
@@ -197,67 +198,65 @@ def check(algo: str, config: Mapping[str, Any]) -> None:
     :param algo: A key of ``ALGORITHMS``
     :param config: The configuration
     """
-    types_of = keys(algo)
-    for key, value in config.items():
-        if key in FLAGS:
+    for key in FLAGS:
+        if key in config:
             raise UserError(f"{key} is no hyperparameter; use the flag --{key.replace('_', '-')}")
-        if key not in types_of:
-            raise unknown(f"hyperparameter for {algo}", key, types_of)
-        if not _has_type(value, types_of[key]):
-            expected = getattr(types_of[key], "__name__", str(types_of[key]))
-            raise UserError(f"{key} is {value!r}; expected {expected}")
-        _check_bounds(key, value)
     for key in ("policy", "n_envs", "n_timesteps", "n_steps"):
         if key not in config:
             raise UserError(
                 f"{key} is missing for this environment; give it with -params {key}:..."
             )
+    _check_arguments(f"hyperparameter for {algo}", "", config, keys(algo))
+    if not config.get("oem_kwargs", True):
+        raise UserError(
+            f"oem_kwargs is empty, but {algo} explores by observation entropy; name an estimator, "
+            "or take a method that does without"
+        )
 
 
-def _check_bounds(key: str, value: Any) -> None:
+def _check_arguments(
+    what: str, where: str, values: Mapping[str, Any], arguments: Mapping[str, Argument]
+) -> None:
+    """Check a mapping against a constructor, and all mappings in it against theirs."""
+    for key, value in values.items():
+        if key not in arguments:
+            raise unknown(what, key, arguments)
+        if not arguments[key].accepts(value):
+            raise UserError(f"{where}{key} is {value!r}; expected {arguments[key].in_words()}")
+        _check_bounds(where, key, value)
+        if key in CLASSES:
+            class_named(key, value, where)
+    for key in arguments:
+        if arguments[key].required and where and key not in values:
+            raise UserError(f"{where}{key} is missing; give it with -params {where}{key}:...")
+    for key in (key for key in PARTS if key in arguments):
+        _check_part(where, key, values, arguments)
+
+
+def _check_part(
+    where: str, key: str, values: Mapping[str, Any], arguments: Mapping[str, Argument]
+) -> None:
+    """Check what stands under a key of ``PARTS`` against the class that it is for."""
+    named_by, implied = PARTS[key]
+    given = values.get(key)
+    if isinstance(named_by, str):
+        name = values.get(named_by)
+        constructed = arguments[named_by].default if name is None else CLASSES[named_by][name]
+    elif isinstance(given, Mapping):
+        constructed = named_by
+    else:  # not asked for
+        return
+    for name in implied:
+        if name in (given or {}):
+            raise UserError(f"{where}{key}.{name} follows from {implied[name]}; leave it out")
+    expected = arguments_of(constructed)
+    allowed = {name: expected[name] for name in expected if name not in implied}
+    _check_arguments(f"key in {where}{key}", f"{where}{key}.", given or {}, allowed)
+
+
+def _check_bounds(where: str, key: str, value: Any) -> None:
     low, high = _BOUNDS.get(key, (-math.inf, math.inf))
-    for number in value if isinstance(value, list) else [value]:
-        if isinstance(number, int | float) and not low <= number <= high:
-            limit = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            raise UserError(f"{key} is {value!r}; expected {limit}")
-
-
-def _constructor_types(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """Arguments of a constructor, with those that it passes on to its base class."""
-    arguments: dict[str, Any] = {}
-    for each in algorithm.__mro__:
-        constructor = vars(each).get("__init__")
-        if constructor is None:
-            continue
-        parameters = inspect.signature(constructor).parameters.values()
-        hints = typing.get_type_hints(constructor)
-        named = [
-            p for p in parameters if p.kind == p.POSITIONAL_OR_KEYWORD or p.kind == p.KEYWORD_ONLY
-        ]
-        for parameter in named:
-            arguments.setdefault(parameter.name, hints.get(parameter.name, Any))
-        if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
-            break
-    del arguments["self"]
-    return arguments
-
-
-def _has_type(value: Any, expected: Any) -> bool:
-    """Whether a value from YAML can stand for an argument of this type."""
-    origin, options = typing.get_origin(expected), typing.get_args(expected)
-    if origin in (typing.Union, types.UnionType):
-        return any(_has_type(value, option) for option in options)
-    if origin is typing.Literal:
-        return value in options
-    if origin is type or expected is Any:  # classes are given by name, see build.py
-        return expected is Any or isinstance(value, str)
-    kind = origin or expected
-    if kind in (float, int) and isinstance(value, bool):
-        return False
-    if kind is float:
-        return isinstance(value, int | float) and math.isfinite(value)
-    if kind is Sequence:
-        return isinstance(value, list) and all(_has_type(each, options[0]) for each in value)
-    if kind is not None and "Callable" in str(kind):  # a schedule
-        return isinstance(value, str) and re.fullmatch(r"lin_[\d.eE+-]+", value) is not None
-    return isinstance(value, type(None) if kind is None else kind)
+    for number in numbers_in(value):
+        if not low <= number <= high:
+            limit = f"at least {low}" if number < low else f"at most {high}"
+            raise UserError(f"{where}{key} is {value!r}; expected {limit}")
