@@ -15,7 +15,6 @@ import pathlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from numbers import Integral
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,8 +27,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
-from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
 from sb3_e2c.constraints import (
@@ -41,14 +39,15 @@ from sb3_e2c.constraints import (
     violation,
 )
 from sb3_e2c.losses import approx_kl, clip_fraction, normalize, policy_loss, value_loss
-from sb3_e2c.monitor import TeamMonitor, named_costs
+from sb3_e2c.monitor import named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory, Sequences
-from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
+from sb3_e2c.teams import check_counts, check_subclass, check_team, monitored, team_of
+from sb3_e2c.vec_env import share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
 
@@ -168,7 +167,7 @@ class MAPPO(PPO):
         self.clip_range_vf = None if clip_range_vf is None else FloatSchedule(clip_range_vf)
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
-        self.agents, self.critic_state_dim = _team(self.env)
+        self.agents, self.critic_state_dim = team_of(self.env)
         self._recorder: TeamRecorder | None = None
         if _init_setup_model:
             self._setup_model()
@@ -180,16 +179,7 @@ class MAPPO(PPO):
         if isinstance(env, (ParallelEnv, AECEnv)):
             world = env
             env = share_parameters(lambda: world, n_worlds=1)
-        wrapped = OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        if is_vecenv_wrapped(wrapped, SB3VecEnvWrapper):
-            raise TypeError(
-                "env is SuperSuit's own vector environment, which does not say how many agents "
-                "share a world; use sb3_e2c.share_parameters(make_env, n_worlds=...) instead"
-            )
-        is_team = isinstance(wrapped.unwrapped, MultiAgentVecEnv)
-        if is_team and not is_vecenv_wrapped(wrapped, TeamMonitor):
-            wrapped = TeamMonitor(wrapped)
-        return wrapped
+        return monitored(OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
 
     @property
     def n_agents(self) -> int:
@@ -233,40 +223,21 @@ class MAPPO(PPO):
         self.critic_lr_schedule: Schedule | None = None if own is None else FloatSchedule(own)
 
     def _check_setup(self) -> None:
-        for name in ("n_steps", "batch_size", "n_epochs"):
-            number = getattr(self, name)
-            if not isinstance(number, Integral) or number < 1:
-                raise ValueError(f"{name} is {number!r}; expected a whole number of at least 1")
-        if self.batch_size < self.n_agents:
-            raise ValueError(
-                f"batch_size is {self.batch_size}, smaller than the team of {self.n_agents} "
-                "agents; a minibatch holds whole team steps, so raise batch_size"
-            )
-        for name, kind in (("policy_class", TeamPolicy), ("multipliers_class", Multipliers)):
-            given = getattr(self, name)
-            if not isinstance(given, type) or not issubclass(given, kind):
-                raise TypeError(f"{name} is {given!r}; expected a subclass of {kind.__name__}")
+        check_counts(
+            self.n_agents,
+            n_steps=self.n_steps,
+            batch_size=self.batch_size,
+            n_epochs=self.n_epochs,
+        )
+        check_subclass("policy_class", self.policy_class, TeamPolicy)
+        check_subclass("multipliers_class", self.multipliers_class, Multipliers)
         if self.env is not None:
-            self._check_team(self.env)
-
-    def _check_team(self, env: VecEnv) -> None:
-        agents, critic_state_dim = _team(env)
-        if agents != self.agents:
-            raise ValueError(
-                f"the environment has the agents {agents}, but the model was made for "
-                f"{self.agents}; use an environment with the same team"
-            )
-        if critic_state_dim != self.critic_state_dim:
-            raise ValueError(
-                f"the environment reports {critic_state_dim} numbers in info['critic_state'], but "
-                f"the model's critics were made for {self.critic_state_dim}; use an environment "
-                "with the same settings"
-            )
+            check_team(self.env, self.agents, self.critic_state_dim)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Use another environment with the same team; see ``PPO.set_env``."""
         env = self._wrap_env(env, self.verbose)
-        self._check_team(env)
+        check_team(env, self.agents, self.critic_state_dim)
         super().set_env(env, force_reset)
         self._recorder = None
 
@@ -574,11 +545,3 @@ class MAPPO(PPO):
         target = pathlib.Path(path)
         with atomic_write(target if target.suffix else target.with_suffix(".zip")) as file:
             super().save(file, exclude, include)  # type: ignore[arg-type]
-
-
-def _team(env: VecEnv | None) -> tuple[list[str], int]:
-    """Names of a team's agents and the size of the critics' extra state.
-
-    :param env: A single-agent environment is a team of one
-    """
-    return list(getattr(env, "agents", ["agent"])), getattr(env, "critic_state_dim", 0)

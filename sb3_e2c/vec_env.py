@@ -26,14 +26,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from sb3_e2c.constraints import TeamCost
-from sb3_e2c.worlds import (
-    BatchedWorlds,
-    MakeEnv,
-    SuperSuitWorlds,
-    WorkerWorlds,
-    Worlds,
-    new_env,
-)
+from sb3_e2c.world import MakeEnv, new_env
+from sb3_e2c.worlds import BatchedWorlds, SuperSuitWorlds, WorkerWorlds, Worlds
 
 Backend = Literal["auto", "supersuit", "batched"]
 TeamReturn = Literal["shared", "sum"]

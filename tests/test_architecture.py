@@ -52,7 +52,21 @@ def test_environments_know_nothing_of_learning(path):
     assert library == set()
 
 
-@pytest.mark.parametrize("module", ["callbacks", "evaluation", "vec_env", "monitor", "policies"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "callbacks",
+        "evaluation",
+        "vec_env",
+        "worlds",
+        "world",
+        "monitor",
+        "policies",
+        "buffers",
+        "recorder",
+        "recurrent",
+    ],
+)
 def test_adapters_do_not_know_the_algorithm(module):
     assert starting_with(imported(ROOT / "sb3_e2c" / f"{module}.py"), "sb3_e2c.mappo") == set()
 

@@ -1,0 +1,162 @@
+"""One world as SuperSuit needs it, and what an environment must be like to become one."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from typing_extensions import override
+
+MakeEnv = Callable[[], ParallelEnv]
+
+# SuperSuit lays the infos of a reset over those of the step before it; under a key of their own
+# both arrive.
+RESET_INFO = "_reset_info"
+
+
+class World(BaseParallelWrapper):
+    """A world as SuperSuit needs it: agents in one order, own infos, its own seed and options.
+
+    :param env: environment whose agents all end in the same step
+    :param index: number of the world
+    """
+
+    def __init__(self, env: ParallelEnv, index: int):
+        super().__init__(env)
+        self.index = index
+        self.possible_agents = list(env.possible_agents)
+        self.agents = list(env.possible_agents)  # SuperSuit resets before it looks again
+        self.metadata = getattr(env, "metadata", {})
+        # Multi-agent MuJoCo keeps the mode in the robot's environment only.
+        robot = getattr(env.unwrapped, "single_agent_env", None)
+        self.render_mode = getattr(env, "render_mode", None) or getattr(robot, "render_mode", None)
+        self._space = as_float32(env.observation_space(self.agents[0]))
+
+    @property
+    @override
+    def unwrapped(self) -> ParallelEnv:
+        # SuperSuit reads unwrapped.render_mode, which not every environment has.
+        return self
+
+    @override
+    def observation_space(self, agent: str) -> spaces.Space:
+        return self._space
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Reset, with what is meant for this world if the reset is not an automatic one."""
+        if options is not None:
+            seed, own = options["seeds"][self.index], options["options"][self.index]
+            options = own or None
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._check_agents("reset", observations)
+        own_infos = {a: {RESET_INFO: dict(infos.get(a, {}))} for a in self.agents}
+        return self._observations(observations), own_infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """Step, and refuse what does not fit one row for each agent."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        self._check_agents("step", observations, rewards, terminated, truncated)
+        self._check_end(terminated, truncated)
+        return (
+            self._observations(observations),
+            {agent: rewards[agent] for agent in self.agents},
+            {agent: bool(terminated[agent]) for agent in self.agents},
+            {agent: bool(truncated[agent]) for agent in self.agents},
+            {agent: self._own_info(infos, agent) for agent in self.agents},
+        )
+
+    def _observations(self, observations: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(self._space, spaces.Box):
+            return {agent: observations[agent] for agent in self.agents}
+        dtype = self._space.dtype
+        return {agent: np.array(observations[agent], dtype=dtype) for agent in self.agents}
+
+    def _own_info(self, infos: dict[str, Any], agent: str) -> dict[str, Any]:
+        info = dict(infos.get(agent, {}))
+        info.pop("TimeLimit.truncated", None)  # patched wrappers set it; the VecEnv decides it
+        return info
+
+    def _check_agents(self, call: str, *answers: dict[str, Any]) -> None:
+        missing = sorted({a for answer in answers for a in self.agents if a not in answer})
+        if missing:
+            raise ValueError(
+                f"{call}() of world {self.index} returned nothing for the agents {missing}; "
+                f"expected all of {self.agents}, because each has a slot of its own until all end "
+                "together. Keep ended agents in the environment (zero reward, any observation)"
+            )
+
+    def _check_end(self, terminated: dict[str, Any], truncated: dict[str, Any]) -> None:
+        ended = [agent for agent in self.agents if terminated[agent] or truncated[agent]]
+        if 0 < len(ended) < len(self.agents):
+            others = [agent for agent in self.agents if agent not in ended]
+            raise ValueError(
+                f"the agents {ended} of world {self.index} ended while {others} go on; expected "
+                "all agents of a world to end in the same step. Keep ended agents in the "
+                "environment (zero reward, any observation), or end the episode for all"
+            )
+
+
+def as_float32(space: spaces.Space) -> spaces.Space:
+    """The same space in float32 if it is a box of float64, which SB3's buffers would keep."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.float64:
+        return space
+    with np.errstate(over="ignore"):  # the largest float64 becomes infinity, no bound at all
+        return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32))
+
+
+def new_env(make_env: MakeEnv) -> Any:
+    """Make an environment and check that its agents can share one policy.
+
+    :param make_env: given by the user
+    :return: a ``ParallelEnv`` whose agents have equal spaces
+    """
+    env = make_env()
+    hint = ""
+    if isinstance(env, AECEnv):
+        hint = "; convert it with pettingzoo.utils.conversions.aec_to_parallel(env)"
+    elif isinstance(env, gym.Env):
+        hint = "; a gymnasium environment has one agent, use SB3's make_vec_env for it"
+    if not isinstance(env, ParallelEnv):
+        raise TypeError(
+            f"make_env returned an object of type {type(env).__name__}; expected a PettingZoo "
+            f"ParallelEnv{hint}"
+        )
+    if not getattr(env, "possible_agents", None):
+        raise ValueError(
+            f"{type(env).__name__} has no possible_agents; expected a list of all agents that ever "
+            "act, in a fixed order"
+        )
+    _check_spaces(env, env.observation_space, "observation", "pad_observations_v0")
+    _check_spaces(env, env.action_space, "action", "pad_action_space_v0")
+    return env
+
+
+def _check_spaces(
+    env: ParallelEnv, space: Callable[[str], spaces.Space], kind: str, padding: str
+) -> None:
+    first = env.possible_agents[0]
+    for agent in env.possible_agents[1:]:
+        if space(agent) != space(first):
+            raise ValueError(
+                f"the agents {first!r} and {agent!r} have different {kind} spaces, {space(first)} "
+                f"and {space(agent)}; expected equal ones, because all agents share one policy. "
+                f"Pad them, for example with supersuit.{padding}"
+            )
+
+
+def check_distinct(envs: list[ParallelEnv]) -> None:
+    """Refuse worlds that are one and the same object.
+
+    :param envs: What ``make_env`` returned at different calls
+    """
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise ValueError(
+            "make_env returned the same environment twice; expected a new one at every call, "
+            "because worlds are independent. Make it inside the function: "
+            "share_parameters(lambda: MyEnv(...)), not share_parameters(lambda: env)"
+        )
