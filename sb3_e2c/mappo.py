@@ -337,8 +337,10 @@ class MAPPO(PPO):
                 states = states * running.to(states)[:, None]
             with self._explained_divergence():
                 actions, states = self.policy.act(tensor, states)  # type: ignore[arg-type]
-        shape = (len(obs), *self.action_space.shape)  # type: ignore[misc]
-        return actions.cpu().numpy().reshape(shape), states
+                array = actions.cpu().numpy()
+                if not np.isfinite(array).all():
+                    raise ValueError("an action is not finite")
+        return array.reshape(len(obs), *self.action_space.shape), states  # type: ignore[misc]
 
     def _running(self, memory: Memory, episode_starts: Any) -> Memory:
         """Hidden states with those of worlds at the start of an episode set to zero."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -326,7 +327,22 @@ class TeamPolicy(ActorCriticPolicy):
         :param states: Hidden states of the actor, shape (S, H)
         :return: Actions (S, ...), and the next hidden states
         """
-        return self.get_distribution(obs).get_actions(deterministic=False), states
+        features = super().extract_features(obs, self.pi_features_extractor)
+        assert isinstance(features, th.Tensor)
+        return self._sample(self.mlp_extractor.forward_actor(features)), states
+
+    def _sample(self, latent_pi: th.Tensor) -> th.Tensor:
+        """Actions from the actor's last hidden layer.
+
+        The same numbers as from torch's distribution, whose checks take longer than the network.
+
+        :param latent_pi: Shape (S, H)
+        """
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            mean = self.action_net(latent_pi)
+            return mean + th.randn_like(mean) * self.log_std.exp()
+        distribution = self._get_action_dist_from_latent(latent_pi)
+        return distribution.get_actions(deterministic=False)
 
     def _flatten_actions(self, actions: th.Tensor) -> th.Tensor:
         """Actions (B, N, A) as SB3's distributions want them: (B·N, A), or (B·N,) if discrete."""

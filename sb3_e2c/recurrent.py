@@ -99,19 +99,20 @@ class GruPolicy(TeamPolicy):
 
     def act(self, obs: th.Tensor, states: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Sample actions; see :meth:`TeamPolicy.act`."""
-        distribution, states = self._step(obs, states)
-        return distribution.get_actions(deterministic=False), states
+        states = self._step(obs, states)
+        return self._sample(states), states
 
-    def _step(self, obs: th.Tensor, states: th.Tensor) -> tuple[Distribution, th.Tensor]:
+    def _step(self, obs: th.Tensor, states: th.Tensor) -> th.Tensor:
+        """Next hidden states of the actor, its last layer before the actions, shape (S, H)."""
         features = super(TeamPolicy, self).extract_features(obs)
         features = features[0] if isinstance(features, tuple) else features
         hidden = self.mlp_extractor.forward_actor(features)
-        states = run_step(self.actor_gru, hidden, states)
-        return self._get_action_dist_from_latent(states), states
+        return run_step(self.actor_gru, hidden, states)
 
     def get_distribution(self, obs: Any) -> Distribution:
         """Action distribution at the start of an episode, where hidden states are zero."""
-        return self._step(obs, self._no_states(len(obs)))[0]
+        states = self._step(obs, self._no_states(len(obs)))
+        return self._get_action_dist_from_latent(states)
 
     def _no_states(self, n_slots: int) -> th.Tensor:
         return th.zeros(n_slots, self.gru_hidden_size, device=self.device)
@@ -142,7 +143,8 @@ class GruPolicy(TeamPolicy):
                 running = ~np.asarray(episode_start, dtype=bool)
                 states = states * th.as_tensor(running, device=self.device)[:, None]
         with th.no_grad():
-            distribution, states = self._step(obs, states)
+            states = self._step(obs, states)
+            distribution = self._get_action_dist_from_latent(states)
             actions = distribution.get_actions(deterministic=deterministic).cpu().numpy()
         actions = self._clip(actions.reshape(-1, *self.action_space.shape))  # type: ignore[misc]
         return (actions if vectorized else actions.squeeze(axis=0)), (states[None].cpu().numpy(),)
