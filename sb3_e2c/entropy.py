@@ -195,6 +195,15 @@ def _count_visits(codes: np.ndarray, columns: np.ndarray, filled: np.ndarray) ->
     return visits
 
 
+# A long memory does not fit into a processor's cache. The first so many numbers of an observation
+# show of most earlier ones that they are too far away; the rest of those is never read.
+_GLANCE = 16
+# It pays if fewer than one in so many is left after the glance,
+_FEW = 8
+# and if there are at least so many numbers.
+_SMALL = 16_384
+
+
 @njit(cache=True)
 def _kth_distances(
     observations: np.ndarray, columns: np.ndarray, filled: np.ndarray, k: int
@@ -213,56 +222,99 @@ def _kth_distances(
     for slot in range(len(observations)):
         n = filled[slot]
         if n > 0:
-            _squared_distances(observations[slot], columns[slot], squared[:n])
-            distances[slot] = np.sqrt(np.float64(_kth_smallest(squared[:n], nearest)))
+            least = _kth_squared_distance(observations[slot], columns[slot], squared[:n], nearest)
+            distances[slot] = np.sqrt(np.float64(least))
         columns[slot, :, n] = observations[slot]
         filled[slot] += 1
     return distances
 
 
 @njit(cache=True)
-def _squared_distances(query: np.ndarray, columns: np.ndarray, squared: np.ndarray) -> None:
-    """Squared distances of the first n observations, four numbers of each at a time.
+def _kth_squared_distance(
+    query: np.ndarray, columns: np.ndarray, squared: np.ndarray, nearest: np.ndarray
+) -> np.float32:
+    """Squared distance of the k-th nearest of n observations, or of the farthest if fewer.
+
+    :param query: shape (D,)
+    :param columns: shape (D, capacity)
+    :param squared: work space, shape (n,)
+    :param nearest: work space, shape (k,)
+    """
+    n, k = len(squared), min(len(nearest), len(squared))
+    nearest[:k] = np.inf
+    squared[:] = 0.0
+    if n * len(query) < _SMALL:
+        _add_squares(query, columns, 0, len(query), 0, n, squared)
+        _keep_smallest(squared, nearest[:k])
+        return nearest[k - 1]
+    recent = max(n - 4 * k, 0)  # the latest ones are the closest in a trajectory: look there first
+    _add_squares(query, columns, 0, len(query), recent, n, squared)
+    _keep_smallest(squared[recent:], nearest[:k])
+    glance = min(_GLANCE, len(query))
+    _add_squares(query, columns, 0, glance, 0, recent, squared)
+    left = 0
+    for i in range(recent):
+        left += squared[i] < nearest[k - 1]
+    if left * _FEW > recent:
+        _add_squares(query, columns, glance, len(query), 0, recent, squared)
+    elif glance < len(query):
+        for i in range(recent - 1, -1, -1):
+            if squared[i] < nearest[k - 1]:
+                _add_squares(query, columns, glance, len(query), i, i + 1, squared)
+    _keep_smallest(squared[:recent], nearest[:k])
+    return nearest[k - 1]
+
+
+@njit(cache=True)
+def _add_squares(
+    query: np.ndarray,
+    columns: np.ndarray,
+    begin: int,
+    end: int,
+    first: int,
+    last: int,
+    squared: np.ndarray,
+) -> None:
+    """Add squared differences in some numbers of the observations, four of them at a time.
 
     Differences come before squares, so near duplicates keep their relative precision, unlike with
     |a|^2 - 2ab + |b|^2.
 
     :param query: shape (D,)
     :param columns: shape (D, capacity)
-    :param squared: the result, shape (n,)
+    :param begin: first of the numbers
+    :param end: one past the last of them
+    :param first: first of the observations
+    :param last: one past the last of them
+    :param squared: the sums, shape (n,)
     """
-    squared[:] = 0.0
-    whole = len(query) - len(query) % 4
-    for d in range(0, whole, 4):
+    whole = end - (end - begin) % 4
+    for d in range(begin, whole, 4):
         a, b, c, e = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
         qa, qb, qc, qe = query[d], query[d + 1], query[d + 2], query[d + 3]
-        for i in range(len(squared)):
+        for i in range(first, last):
             ab = (a[i] - qa) * (a[i] - qa) + (b[i] - qb) * (b[i] - qb)
             squared[i] += ab + ((c[i] - qc) * (c[i] - qc) + (e[i] - qe) * (e[i] - qe))
-    for d in range(whole, len(query)):
+    for d in range(whole, end):
         a, qa = columns[d], query[d]
-        for i in range(len(squared)):
+        for i in range(first, last):
             squared[i] += (a[i] - qa) * (a[i] - qa)
 
 
 @njit(cache=True)
-def _kth_smallest(numbers: np.ndarray, smallest: np.ndarray) -> np.float32:
-    """The ``len(smallest)``-th smallest number, or the largest if there are fewer.
+def _keep_smallest(numbers: np.ndarray, smallest: np.ndarray) -> None:
+    """Insert numbers into a list of the smallest ones, the last number first.
 
-    :param numbers: shape (n,), n >= 1
-    :param smallest: work space, kept in ascending order
+    :param numbers: shape (n,)
+    :param smallest: in ascending order, shape (k,)
     """
-    k = min(len(smallest), len(numbers))
-    smallest[:k] = np.inf
-    # latest first: they are the closest in a trajectory, so later ones are seldom inserted
     for i in range(len(numbers) - 1, -1, -1):
-        place = k - 1
+        place = len(smallest) - 1
         if numbers[i] < smallest[place]:
             while place > 0 and smallest[place - 1] > numbers[i]:
                 smallest[place] = smallest[place - 1]
                 place -= 1
             smallest[place] = numbers[i]
-    return smallest[k - 1]
 
 
 def _positive_integer(name: str, value: Any) -> int:
