@@ -76,8 +76,8 @@ class OEMRewardCallback(BaseCallback):
             self.estimator.reset(len(starts))
             self.episode_bonuses = np.zeros(len(starts))
         if self.verbose > 0:
-            mode = "instead of" if self.psi is None else f"times {self.psi:g} beside"
-            print(f"{type(self.estimator).__name__} bonus {mode} the extrinsic reward")
+            mode = "in place of" if self.psi is None else f"times {self.psi:g} beside"
+            print(f"Learning from the {type(self.estimator).__name__} bonus {mode} the reward")
 
     def _on_rollout_start(self) -> None:
         self._finished = []

@@ -18,7 +18,8 @@ class E2CMAPPO(MAPPO):
 
     :param args: See :class:`MAPPO`
     :param oem_kwargs: Arguments of the callback; None: the bonus of the 5th nearest neighbor
-        alone ("pure"), as the paper has it for the particle tasks
+        alone ("pure"), as the paper has it for the particle tasks. Without ``psi`` the bonus takes
+        the place of the environment's reward
     :param kwargs: See :class:`MAPPO`
     """
 
@@ -30,7 +31,7 @@ class E2CMAPPO(MAPPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._oem_callback = OEMRewardCallback(**self.oem_kwargs)
+        self._oem_callback = OEMRewardCallback(**{"verbose": self.verbose, **self.oem_kwargs})
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -45,6 +45,14 @@ class TeamEvaluation:
     lengths: np.ndarray
     """Steps, shape (E,)"""
 
+    def __str__(self) -> str:
+        error = self.returns.std() / np.sqrt(max(len(self.returns) - 1, 1))
+        costs = ", ".join(f"{cost:.2f}" for cost in self.mean_costs)
+        return (
+            f"{len(self.returns)} episodes: return {self.mean_return:.2f} ± {error:.2f}"
+            f"{f', cost {costs}' if costs else ''}"
+        )
+
     @property
     def mean_return(self) -> float:
         """Mean return of the team."""
@@ -85,7 +93,7 @@ def evaluate_team(
     model: PolicyPredictor,
     env: VecEnv,
     n_episodes: int = 10,
-    deterministic: bool = True,
+    deterministic: bool = False,
     render: bool = False,
     callback: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
 ) -> TeamEvaluation:
@@ -98,7 +106,8 @@ def evaluate_team(
     :param model: anything with SB3's ``predict``, such as any SB3 algorithm or policy
     :param env: made by ``share_parameters``, perhaps wrapped
     :param n_episodes: E
-    :param deterministic: whether to take the most likely actions instead of sampled ones
+    :param deterministic: whether to take the most likely actions; sampled ones are the default,
+        because rewards were learned and costs limited for the sampled policy
     :param render: whether to render after every step
     :param callback: called after each step for each world whose episodes are still wanted, with
         ``locals()`` and ``globals()``; ``world``, ``info`` (its first slot's) and ``done`` are
@@ -184,11 +193,15 @@ class TeamEvalCallback(EvalCallback):
     highest mean return; as long as there is none, the one that exceeds them least. Thus
     ``best_mean_reward`` may fall when the first safe model is found. ``evaluations.npz`` has
     SB3's keys and ``costs``, shape (evaluations, E, M). Evaluating changes nothing in the training,
-    also with sampled actions.
+    also with sampled actions. They are the default, because they are what is limited.
+
+    As in SB3, ``eval_freq`` counts calls of ``env.step``, each of which is one step of every slot:
+    ``eval_freq=24_000 // env.num_envs`` evaluates every 24,000 agent steps.
 
     :param eval_env: made by ``share_parameters``, perhaps wrapped
     :param cost_limits: limits on the team's costs of an episode, shape (M,); None takes those of
         the model, if it has any
+    :param deterministic: whether to take the most likely actions
     :param kwargs: of SB3's ``EvalCallback``
     """
 
@@ -196,10 +209,11 @@ class TeamEvalCallback(EvalCallback):
         self,
         eval_env: VecEnv,
         cost_limits: float | Sequence[float] | None = None,
+        deterministic: bool = False,
         **kwargs: Any,
     ):
         unwrap_team(eval_env, "TeamEvalCallback")
-        super().__init__(eval_env, **kwargs)
+        super().__init__(eval_env, deterministic=deterministic, **kwargs)
         self.cost_limits = None if cost_limits is None else parse_cost_limits(cost_limits)
         self.evaluations_costs: list[np.ndarray] = []
         self._best_score = (-np.inf, -np.inf)

@@ -24,6 +24,10 @@ class Multipliers(nn.Module, ABC):
     def __init__(self, shape: tuple[int, int], **kwargs: Any):  # noqa: ARG002
         super().__init__()
 
+    def extra_repr(self) -> str:
+        """The multipliers, for ``print``."""
+        return f"values={self.values.tolist()}"
+
     @abstractmethod
     def update(self, violation: th.Tensor) -> None:
         """Take one dual step.

@@ -206,8 +206,8 @@ def test_verbose_tells_which_bonus_is_given(capsys):
     started(nearest(verbose=1), n_slots=1)
     started(nearest(verbose=1, psi=0.3), n_slots=1)
     assert capsys.readouterr().out.splitlines() == [
-        "NearestNeighbor bonus instead of the extrinsic reward",
-        "NearestNeighbor bonus times 0.3 beside the extrinsic reward",
+        "Learning from the NearestNeighbor bonus in place of the reward",
+        "Learning from the NearestNeighbor bonus times 0.3 beside the reward",
     ]
 
 

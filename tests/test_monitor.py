@@ -126,7 +126,8 @@ def test_sb3s_own_evaluation_comes_to_an_end():
     returns, lengths = evaluate_policy(
         model, model.get_env(), n_eval_episodes=4, return_episode_rewards=True
     )
-    assert returns == [evaluate_team(model, model.get_env(), 1).returns[0]] * 4
+    team = evaluate_team(model, model.get_env(), 1, deterministic=True)
+    assert returns == [team.returns[0]] * 4
     assert lengths == [4] * 4
 
 

@@ -835,7 +835,7 @@ def test_the_demo_trains_evaluates_films_and_draws(tmp_path, capsys, monkeypatch
     monkeypatch.setattr(demo, "WORLDS", 2)
     demo.main(["-n", "4800", "-f", str(tmp_path)])
     text = capsys.readouterr().out
-    for words in ("team reward", "team cost", "cost limit", "lambda", "agent steps per second"):
+    for words in ("mean reward", "mean cost", "limit on it", "lambda", "agent steps per second"):
         assert words in text
     run = run_folder(tmp_path)
     assert (run / "learning.png").is_file()

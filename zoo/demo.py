@@ -74,10 +74,10 @@ def _speed(folder: Path) -> float:
 
 def _table(before: dict[str, Any], after: dict[str, Any]) -> str:
     rows = [("", "before", "after")]
-    for name, key in (("team reward", "team_return"), ("team cost", "team_cost")):
+    for name, key in (("mean reward", "team_return"), ("mean cost", "team_cost")):
         cells = [f"{s[key]:.2f} ± {s[f'{key}_se']:.2f}" for s in (before, after)]
         rows.append((name, cells[0], cells[1]))
-    rows.append(("cost limit", "", f"{after['cost_limits'][0]:g}"))
+    rows.append(("limit on it", "", f"{after['cost_limits'][0]:g}"))
     rows.append(("lambda", f"{before['lambda']:.3f}", f"{after['lambda']:.3f}"))
     title = f"{EPISODES} episodes of {ALGO} on {ENV_ID}, sampled actions, mean ± standard error"
     return "\n".join([title, *(f"{name:<12}{b:>16}{a:>16}" for name, b, a in rows)])
