@@ -10,6 +10,7 @@ from sb3_e2c.e2c_mappo import E2CMAPPO
 from sb3_e2c.entropy import NearestNeighbor, VisitCount
 from sb3_e2c.evaluation import TeamEvalCallback, TeamEvaluation, evaluate_team
 from sb3_e2c.mappo import MAPPO
+from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.multipliers import GradientMultipliers, PIDMultipliers
 from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
 
@@ -25,6 +26,7 @@ __all__ = [
     "PIDMultipliers",
     "TeamEvalCallback",
     "TeamEvaluation",
+    "TeamMonitor",
     "VisitCount",
     "evaluate_team",
     "share_parameters",
