@@ -23,6 +23,13 @@ _REGISTRY: dict[str, tuple[str, dict[str, Any]]] = {
     for rovers, coupling in _ROVERS_AND_COUPLING
 }
 
+# An adversary acts in these, too; metadata["team"] and metadata["opponents"] say who is who.
+_WITH_OPPONENTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "PhysicalDeception-v0": ("physical_deception_v0", {}),
+    "KeepAway-v0": ("keep_away_v0", {}),
+    "PredatorPrey-v0": ("predator_prey_v0", {}),
+}
+
 
 def _create(env_id: str, **parameters: Any) -> ParallelEnv:
     """``pettingzoo.make`` for one id; pickled by name, so that a worker process registers too."""
@@ -30,7 +37,7 @@ def _create(env_id: str, **parameters: Any) -> ParallelEnv:
 
 
 def _register() -> None:
-    for env_id, (module, parameters) in _REGISTRY.items():
+    for env_id, (module, parameters) in (_REGISTRY | _WITH_OPPONENTS).items():
         if env_id not in pettingzoo.parallel_registry:
             entry_point = f"{__name__}.{module}:parallel_env"
             pettingzoo.register("parallel", env_id, entry_point, kwargs=parameters)
@@ -40,4 +47,9 @@ _register()
 
 ENV_IDS: dict[str, Callable[..., ParallelEnv]] = {
     env_id: partial(_create, env_id) for env_id in _REGISTRY
+}
+
+# Not among ENV_IDS until the zoo can train them: their agents differ in role and observation size.
+OPPONENT_ENV_IDS: dict[str, Callable[..., ParallelEnv]] = {
+    env_id: partial(_create, env_id) for env_id in _WITH_OPPONENTS
 }

@@ -1,0 +1,254 @@
+"""The batched simulator of the particle tasks: ``W`` worlds in one set of arrays, two groups."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_e2c.envs._particle_config import TASKS, ParticleConfig, Start, draw_start, place
+from sb3_e2c.envs._particle_kernels import Outcome, Rules, State, observe_worlds, step_worlds
+
+Grouped = dict[str, np.ndarray]
+Infos = dict[str, dict[str, np.ndarray]]
+
+_DIRECTIONS = np.array([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+_GROUPS = ("team", "opponents")
+
+
+class ParticleSimulator:
+    """All worlds step together; each has its own random stream for the starts of its episodes.
+
+    Agents come in two groups, "team" and "opponents", whose observations differ in size. What
+    belongs to agents is a dict of arrays by group, shape (W, n, ...), with the agents in the order
+    of ``groups``. A world seeded with ``s`` behaves like the environment reset with seed ``s``.
+    Worlds are never reset by :meth:`step`. The object pickles with its whole state.
+
+    :param config: task and parameters
+    :param n_worlds: number of worlds, W
+    :param render_mode: ``"rgb_array"`` or None
+    """
+
+    def __init__(
+        self, config: ParticleConfig, n_worlds: int, render_mode: str | None = None
+    ) -> None:
+        if n_worlds < 1:
+            raise ValueError(f"n_worlds is {n_worlds}; expected at least 1")
+        check_render_mode(render_mode)
+        task = config.task
+        self.config = config
+        self.n_worlds = n_worlds
+        self.render_mode = render_mode
+        self.metadata = task.metadata
+        self.possible_agents = task.agents
+        self.groups = task.groups
+        self.observation_sizes = task.observation_sizes
+        self._members = task.members
+        self._observation_spaces = observation_spaces(config)
+        self._action_spaces = action_spaces(config)
+        self._rules = tuple(_rules(config))
+        bodies = task.bodies[: len(task.agents)]
+        self._accelerations = np.array([[body.acceleration] for body in bodies])
+        self._rngs: list[np.random.Generator | None] = [None] * n_worlds
+        self._needs_reset = np.ones(n_worlds, dtype=bool)
+        self.state = _initial_state(n_worlds, len(task.agents), len(task.bodies))
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Observation space of an agent; the same object at every call."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space:
+        """Action space of an agent; the same object at every call."""
+        return self._action_spaces[agent]
+
+    def reset(
+        self,
+        worlds: np.ndarray,
+        seeds: Sequence[int | None],
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Grouped, Infos]:
+        """Start a new episode in some worlds.
+
+        :param worlds: indices of the worlds, shape (R,)
+        :param seeds: for each of them a seed that restarts its stream, or None to continue it
+        :param options: "agents" (4, 2) or (R, 4, 2), "landmarks" (K, 2) or (R, K, 2) and "goal",
+            one number or (R,), place by hand what they name; other keys are ignored
+        :return: observations (R, n, D) and infos (empty), both by group
+        """
+        worlds = np.asarray(worlds, dtype=np.int64)
+        starts = [self._draw(w, seed) for w, seed in zip(worlds.tolist(), seeds, strict=True)]
+        if not starts:
+            return self._observe(worlds), {group: {} for group in _GROUPS}
+        goals, positions = zip(*starts, strict=True)
+        start = Start(np.array(goals, dtype=np.int64), np.stack(positions))
+        place(self.config.task, start, options)
+        self.state.goals[worlds] = start.goals
+        self.state.positions[worlds] = self.state.starts[worlds] = start.positions
+        self.state.velocities[worlds] = 0.0
+        self.state.clock[worlds] = 0
+        self._needs_reset[worlds] = False
+        return self._observe(worlds), {group: {} for group in _GROUPS}
+
+    def _draw(self, world: int, seed: int | None) -> tuple[int, np.ndarray]:
+        rng = self._rngs[world]
+        if seed is not None or rng is None:
+            rng = self._rngs[world] = np.random.default_rng(seed)
+        return draw_start(self.config.task, rng)
+
+    def _observe(self, worlds: np.ndarray) -> Grouped:
+        observations = self._empty_observations(len(worlds))
+        observe_worlds(self._rules, tuple(self.state), worlds, *observations.values())
+        return observations
+
+    def _empty_observations(self, n_worlds: int) -> Grouped:
+        return {
+            group: np.empty(
+                (n_worlds, len(self.groups[group]), self.observation_sizes[group]), np.float32
+            )
+            for group in _GROUPS
+        }
+
+    def step(
+        self, actions: Mapping[str, np.ndarray]
+    ) -> tuple[Grouped, Grouped, np.ndarray, np.ndarray, Infos]:
+        """Advance all worlds by one step, without any reset.
+
+        :param actions: by group, integers (W, n), or numbers (W, n, 5) clipped to [0, 1]
+        :return: observations (W, n, D) and rewards (W, n) by group, terminated (W,), truncated
+            (W,), and infos by group, "cost" (W, n); all of them fresh
+        """
+        if self._needs_reset.any():
+            raise ValueError(
+                f"step() was called although the episode of world(s) "
+                f"{np.flatnonzero(self._needs_reset).tolist()} has ended or not begun; reset first"
+            )
+        controls = self._controls(actions)
+        observations = self._empty_observations(self.n_worlds)
+        shape = controls.shape[:2]
+        out = Outcome(
+            **observations,
+            rewards=np.empty(shape, np.float32),
+            costs=np.empty(shape, np.float32),
+            truncated=np.empty(self.n_worlds, np.bool_),
+        )
+        step_worlds(self._rules, tuple(self.state), controls, tuple(out))
+        self._needs_reset[:] = out.truncated
+        rewards = {group: out.rewards[:, members] for group, members in self._members.items()}
+        infos = {group: {"cost": out.costs[:, self._members[group]]} for group in _GROUPS}
+        return observations, rewards, np.zeros(self.n_worlds, np.bool_), out.truncated, infos
+
+    def _controls(self, actions: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The forces (W, A, 2) that the agents apply, in world order."""
+        tail = (5,) if self.config.continuous_actions else ()
+        dtype = np.float64 if self.config.continuous_actions else np.int64
+        joint = np.empty((self.n_worlds, len(self.possible_agents), *tail), dtype)
+        for group, members in self._members.items():
+            if group not in actions:
+                raise ValueError(f"actions have no {group!r}; expected all of {_GROUPS}")
+            given = np.asarray(actions[group])
+            if given.shape != (shape := joint[:, members].shape):
+                raise ValueError(
+                    f"actions of the {group} have shape {given.shape}; expected {shape}"
+                )
+            if not self.config.continuous_actions and given.dtype.kind not in "iu":
+                raise ValueError(
+                    f"actions of the {group} are {given.dtype}; expected integers, or use "
+                    "continuous_actions=True"
+                )
+            joint[:, members] = given
+        return to_forces(joint, self.possible_agents) * self._accelerations
+
+    def render(self, world: int = 0) -> np.ndarray:
+        """Picture of one world, drawn by mpe2.
+
+        :param world: index of the world
+        :return: RGB image, uint8, shape (height, width, 3)
+        """
+        require_render_mode(self.render_mode)
+        from sb3_e2c.envs._particle_mpe2 import new_world, picture, restart  # only for pictures
+
+        painter = new_world(self.config, self.render_mode)
+        restart(painter, int(self.state.goals[world]), self.state.starts[world])
+        positions = self.state.positions[world]
+        for entity, position in zip(painter.world.entities, positions, strict=True):
+            entity.state.p_pos = position.copy()
+        return picture(painter)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuse an unknown mode."""
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
+
+
+def require_render_mode(render_mode: str | None) -> None:
+    """Refuse to draw without a mode."""
+    if render_mode is None:
+        raise ValueError(
+            "render() needs a render mode, found None; create the environment with "
+            "render_mode='rgb_array'"
+        )
+
+
+def observation_spaces(config: ParticleConfig) -> dict[str, spaces.Box]:
+    """Observation space of every agent, shape (D,)."""
+    task = config.task
+    return {
+        agent: spaces.Box(-np.inf, np.inf, (task.observation_sizes[group],), np.float32)
+        for group, names in task.groups.items()
+        for agent in names
+    }
+
+
+def action_spaces(config: ParticleConfig) -> dict[str, spaces.Space]:
+    """Action space of every agent."""
+    if config.continuous_actions:
+        return {agent: spaces.Box(0.0, 1.0, (5,)) for agent in config.task.agents}
+    return {agent: spaces.Discrete(5) for agent in config.task.agents}
+
+
+def to_forces(actions: np.ndarray, agents: Sequence[str]) -> np.ndarray:
+    """Directions (W, A, 2) of integer actions (W, A) or of numbers (W, A, 5), checked."""
+    is_discrete = actions.dtype.kind in "iu"
+    bad = (actions < 0) | (actions > 4) if is_discrete else ~np.isfinite(actions).all(axis=-1)
+    if bad.any():
+        world, agent = np.argwhere(bad)[0]
+        raise ValueError(
+            f"the action of {agents[agent]} in world {world} is {actions[world, agent].tolist()}; "
+            f"expected {'one of 0, ..., 4' if is_discrete else 'five finite numbers'}"
+        )
+    if is_discrete:
+        return _DIRECTIONS[actions]
+    inside = np.clip(actions, 0.0, 1.0)
+    return inside[..., 2::2] - inside[..., 1::2]
+
+
+def _rules(config: ParticleConfig) -> Rules:
+    task = config.task
+    sizes, collides, _, max_speeds = zip(*task.bodies, strict=True)
+    n_agents = len(task.agents)
+    return Rules(
+        task=TASKS.index(task),
+        max_cycles=config.max_cycles,
+        is_team=np.array([agent in task.team for agent in task.agents]),
+        sizes=np.array(sizes),
+        collides=np.array(collides),
+        max_speeds=np.array(max_speeds[:n_agents]),
+        counted=config.counted,
+        views=np.array([task.opponent_view, task.team_view]),
+    )
+
+
+def _initial_state(n_worlds: int, n_agents: int, n_entities: int) -> State:
+    return State(
+        positions=np.zeros((n_worlds, n_entities, 2)),
+        velocities=np.zeros((n_worlds, n_agents, 2)),
+        goals=np.zeros(n_worlds, dtype=np.int64),
+        clock=np.zeros(n_worlds, dtype=np.int64),
+        starts=np.zeros((n_worlds, n_entities, 2)),
+    )
