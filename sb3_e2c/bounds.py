@@ -137,7 +137,7 @@ def categorical_kl(old_log_probs: np.ndarray, new_log_probs: np.ndarray) -> np.n
     old_probs = np.exp(old_log_probs)
     log_ratio = np.zeros_like(old_probs)
     np.subtract(old_log_probs, new_log_probs, out=log_ratio, where=old_probs > 0)
-    return (old_probs * log_ratio).sum(-1)
+    return np.maximum(0.0, (old_probs * log_ratio).sum(-1))  # not −1e-17 where nothing moved
 
 
 def gaussian_kl(
@@ -154,7 +154,7 @@ def gaussian_kl(
     :return: KL(π ‖ π̄), shape (...)
     """
     moved = (np.exp(2 * old_log_std) + (old_mean - new_mean) ** 2) / (2 * np.exp(2 * new_log_std))
-    return (new_log_std - old_log_std + moved - 0.5).sum(-1)
+    return np.maximum(0.0, (new_log_std - old_log_std + moved - 0.5).sum(-1))
 
 
 def sampled_kl(log_ratios: np.ndarray) -> np.ndarray:
@@ -166,7 +166,7 @@ def sampled_kl(log_ratios: np.ndarray) -> np.ndarray:
     :param log_ratios: log q, any shape
     :return: The same shape
     """
-    return _surplus(log_ratios) - log_ratios
+    return np.maximum(0.0, _surplus(log_ratios) - log_ratios)
 
 
 def categorical_tv(old_log_probs: np.ndarray, new_log_probs: np.ndarray) -> np.ndarray:
@@ -195,7 +195,7 @@ def effective_sample_size(log_ratios: np.ndarray) -> float:
     """Share of the samples that still speak about the new joint policy: (Σ q)² / (T W Σ q²).
 
     :param log_ratios: log qᵢ, shape (T, W, N)
-    :return: In (0, 1]; below ½ the joint surrogate is mostly noise
+    :return: In (0, 1]; if it is small, a few samples carry the joint surrogate
     """
     ratios = 1 + _surplus(log_ratios.sum(-1))
     return float(ratios.sum() ** 2 / (ratios.size * (ratios**2).sum()))
@@ -331,8 +331,7 @@ def agent_bounds(
     tvs = _largest_tv(max_kls)
     others = (tvs.sum() - tvs)[:, None]
     return (
-        joint_bound(cost, surrogates, max_kls, epsilon, gamma)
-        + 2 * epsilon / (1 - gamma) * others
+        joint_bound(cost, surrogates, max_kls, epsilon, gamma) + 2 * epsilon / (1 - gamma) * others
     )
 
 
@@ -360,7 +359,7 @@ def printed_not_a_bound(
 
 
 def _surplus(log_ratio: np.ndarray) -> np.ndarray:
-    """q − 1, in double precision and without overflow, any shape."""
+    """The surplus q − 1 of a ratio, in double precision and without overflow, any shape."""
     return np.expm1(np.minimum(log_ratio, MAX_LOG_RATIO), dtype=np.float64)
 
 
