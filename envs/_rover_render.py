@@ -110,7 +110,7 @@ def _draw_sensors(pen: _Pen, config: RoverConfig, state: State) -> None:
         return
     for i, position in enumerate(state.positions):
         disc = pen.box(position, config.sensor_radius)
-        pen.draw.ellipse(disc, fill=(*_color(i), 4), outline=(*_color(i), 70), width=_px(0.75))
+        pen.draw.ellipse(disc, fill=(*_color(i), 4), outline=(*_color(i), 35), width=_px(0.75))
 
 
 def _color(rover: int) -> Color:
@@ -118,7 +118,8 @@ def _color(rover: int) -> Color:
 
 
 def _draw_pois(pen: _Pen, config: RoverConfig, state: State) -> None:
-    """Activation circle, one arc per rover needed (filled by visitors), and the value."""
+    """Activation circle, one arc per rover needed (filled by visitors), and "visitors/needed"."""
+    half = 14.0 * _OVERSAMPLING / pen.scale
     for poi, value, captured in zip(state.pois, config.poi_values, state.captured, strict=True):
         color = _CAPTURED if captured else _OPEN
         visitors = int((np.hypot(*(state.positions - poi).T) <= config.act_radius).sum())
@@ -130,8 +131,10 @@ def _draw_pois(pen: _Pen, config: RoverConfig, state: State) -> None:
             start = -90.0 + part * sweep + 4.0
             alpha, width = (255, 4.0) if part < filled else (90, 2.0)
             pen.draw.arc(ring, start, start + sweep - 8.0, (*color, alpha), _px(width))
-        pen.draw.ellipse(pen.box(poi, 10.0 * _OVERSAMPLING / pen.scale), fill=color)
-        pen.text(poi, f"{value:g}", 12, _PAPER)
+        pen.draw.rounded_rectangle(pen.box(poi, half), _px(4), fill=color)
+        pen.text(poi, f"{filled}/{config.coupling}", 13, _PAPER)
+        if len(set(config.poi_values)) > 1:
+            pen.text(poi - [0.0, 2.0 * half], f"value {value:g}", 12, color)
 
 
 def _draw_rovers(pen: _Pen, state: State) -> None:
