@@ -202,6 +202,8 @@ _GLANCE = 16
 _FEW = 8
 # and if there are at least so many numbers.
 _SMALL = 16_384
+# Those that are left are searched for in blocks, most of which have none.
+_BLOCK = 64
 
 
 @njit(cache=True)
@@ -252,17 +254,26 @@ def _kth_squared_distance(
     _keep_smallest(squared[recent:], nearest[:k])
     glance = min(_GLANCE, len(query))
     _add_squares(query, columns, 0, glance, 0, recent, squared)
-    left = 0
-    for i in range(recent):
-        left += squared[i] < nearest[k - 1]
-    if left * _FEW > recent:
+    if _count_below(squared[:recent], nearest[k - 1]) * _FEW > recent:
         _add_squares(query, columns, glance, len(query), 0, recent, squared)
-    elif glance < len(query):
-        for i in range(recent - 1, -1, -1):
-            if squared[i] < nearest[k - 1]:
-                _add_squares(query, columns, glance, len(query), i, i + 1, squared)
-    _keep_smallest(squared[:recent], nearest[:k])
+        _keep_smallest(squared[:recent], nearest[:k])
+        return nearest[k - 1]
+    for begin in range(0, recent, _BLOCK):
+        end = min(begin + _BLOCK, recent)
+        if _count_below(squared[begin:end], nearest[k - 1]) > 0:
+            for i in range(begin, end):
+                if squared[i] < nearest[k - 1]:
+                    _add_squares(query, columns, glance, len(query), i, i + 1, squared)
+                    _keep_smallest(squared[i : i + 1], nearest[:k])
     return nearest[k - 1]
+
+
+@njit(cache=True)
+def _count_below(numbers: np.ndarray, bound: np.float32) -> int:
+    count = 0
+    for i in range(len(numbers)):
+        count += numbers[i] < bound
+    return count
 
 
 @njit(cache=True)
