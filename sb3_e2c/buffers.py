@@ -16,6 +16,7 @@ from sb3_e2c.losses import penalized_advantages
 from sb3_e2c.policies import StepEvaluation, TeamPolicy
 from sb3_e2c.returns import gae
 from sb3_e2c.sequences import (
+    Cut,
     Memory,
     Sequences,
     cut_at_ends,
@@ -105,7 +106,8 @@ class TeamRolloutBuffer(RolloutBuffer):
     def reset(self, initial: Memory | None = None) -> None:
         """Forget the last rollout; the arrays stay and are overwritten.
 
-        :param initial: Hidden states of all worlds before the next rollout
+        :param initial: Hidden states of all worlds before the next rollout; None: the policy is
+            not recurrent
         """
         self.pos, self.full = 0, False
         self.timeouts: list[Timeout] = []
@@ -172,18 +174,20 @@ class TeamRolloutBuffer(RolloutBuffer):
     def _evaluate(self, policy: TeamPolicy) -> StepEvaluation:
         """Evaluate all networks on the whole rollout, in the order of its rows (T·W)."""
         inputs = self._network_inputs()
-        if not policy.recurrent:
+        if self.initial is None:
             return policy.evaluate_steps(*inputs)
-        assert self.initial is not None, "a recurrent rollout needs its initial hidden states"
-        cut = cut_at_ends(self.dones)
-        indices, batch_sizes = packed_rows(cut, self.n_worlds)
-        rows = th.from_numpy(indices).to(self.device)
-        sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(cut, self.initial))
+        rows, sequences = self._pack(cut_at_ends(self.dones), self.initial)
         observations, actions, critic_states = (each[rows] for each in inputs)
         packed = policy.evaluate_steps(observations, actions, critic_states, sequences)
         back = th.empty_like(rows)
         back[rows] = th.arange(len(rows), device=self.device)
         return StepEvaluation(*(each[back] for each in packed))
+
+    def _pack(self, cut: Cut, initial: Memory) -> tuple[th.Tensor, Sequences]:
+        """Rows of the rollout that make some sequences, shape (B,), and the sequences."""
+        rows, batch_sizes = packed_rows(cut, self.n_worlds)
+        sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(cut, initial))
+        return th.from_numpy(rows).to(self.device), sequences
 
     def compute_returns_and_advantage(  # type: ignore[override]
         self, last_values: np.ndarray, last_cost_values: np.ndarray
@@ -239,7 +243,7 @@ class TeamRolloutBuffer(RolloutBuffer):
         """
         teams = self.to_torch(observations).reshape(-1, self.n_agents, *self.obs_shape)
         sequences = None
-        if policy.recurrent:
+        if self.initial is not None:
             batch_sizes = th.tensor([len(teams)])
             sequences = Sequences(batch_sizes, Memory(latents[0], *latents))
         values, cost_values = policy.team_values(teams, self.to_torch(critic_states), sequences)
@@ -297,24 +301,20 @@ class TeamRolloutBuffer(RolloutBuffer):
         raise NotImplementedError("a team rollout is read with samples() and minibatches()")
 
     def minibatches(
-        self, samples: TeamSamples, n_team_steps: int, recurrent: bool
+        self, samples: TeamSamples, n_team_steps: int
     ) -> Iterator[tuple[TeamSamples, Sequences | None]]:
         """Divide a rollout into random minibatches of nearly equal size.
 
         :param samples: The rollout
-        :param n_team_steps: Largest number of team steps in a minibatch; about that number if
-            minibatches are made of whole sequences
-        :param recurrent: Whether they are
+        :param n_team_steps: Largest number of team steps in a minibatch; about that number in a
+            recurrent rollout, whose minibatches are made of whole sequences
         :return: Minibatches that together hold every team step once, and their sequences
         """
-        if not recurrent:
+        if self.initial is None:
             yield from ((batch, None) for batch in _random_steps(samples, n_team_steps))
             return
-        assert self.initial is not None, "a recurrent rollout needs its initial hidden states"
         for group in random_groups(cut_at_ends(self.dones), n_team_steps):
-            indices, batch_sizes = packed_rows(group, self.n_worlds)
-            rows = th.from_numpy(indices).to(self.device)
-            sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(group, self.initial))
+            rows, sequences = self._pack(group, self.initial)
             yield TeamSamples(*(field[rows] for field in samples)), sequences
 
 

@@ -129,7 +129,6 @@ class MAPPO(PPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        check_cost_scope(cost_scope)
         self.cost_limits = parse_cost_limits(cost_limits)
         self.cost_scope = cost_scope
         self.cost_gamma = cost_gamma
@@ -290,7 +289,7 @@ class MAPPO(PPO):
         assert self._last_obs is not None, "no previous observation: learn() resets first"
         self.policy.set_training_mode(False)
         self._memory = self._running(self._memory, self._last_episode_starts)
-        rollout_buffer.reset(self._memory)
+        rollout_buffer.reset(self._memory if self.policy.recurrent else None)
         states = self._memory.actor.flatten(0, 1)
         recorder = self._recorder
         assert recorder is not None, "learn() makes the recorder"
@@ -379,9 +378,7 @@ class MAPPO(PPO):
 
         :return: False if the policy has moved further than ``target_kl`` allows
         """
-        batches = self.rollout_buffer.minibatches(
-            samples, self.batch_size // self.n_agents, self.policy.recurrent
-        )
+        batches = self.rollout_buffer.minibatches(samples, self.batch_size // self.n_agents)
         for batch, sequences in batches:
             loss, kl = self._loss(batch, sequences, logs)
             if self.target_kl is not None and kl > 1.5 * self.target_kl:

@@ -126,7 +126,7 @@ def test_the_ratio_is_exactly_1_before_the_first_step():
     model = make(line(length=5), batch_size=1000)
     buffer = collect(model)
     samples = buffer.samples(model.policy, model.multipliers.values, normalize_values=False)
-    ((batch, sequences),) = buffer.minibatches(samples, 1000, recurrent=True)
+    ((batch, sequences),) = buffer.minibatches(samples, 1000)
     inputs = (batch.observations, batch.actions, batch.critic_states)
     new = model.policy.evaluate_steps(*inputs, sequences).log_prob
     assert th.exp(new - batch.old_log_prob).eq(1.0).all()
