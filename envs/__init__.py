@@ -16,18 +16,25 @@ _ROVERS_AND_COUPLING = ((6, 2), (6, 3), (6, 4), (8, 3), (8, 4), (10, 4))
 
 # id -> module of this package, parameters of its parallel_env()
 _REGISTRY: dict[str, tuple[str, dict[str, Any]]] = {
-    f"MultiRover-{rovers}-{coupling}-v0": (
-        "multi_rover_v0",
-        {"n_rovers": rovers, "coupling": coupling},
-    )
-    for rovers, coupling in _ROVERS_AND_COUPLING
-}
-
-# An adversary acts in these, too; metadata["team"] and metadata["opponents"] say who is who.
-_WITH_OPPONENTS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{
+        f"MultiRover-{rovers}-{coupling}-v0": (
+            "multi_rover_v0",
+            {"n_rovers": rovers, "coupling": coupling},
+        )
+        for rovers, coupling in _ROVERS_AND_COUPLING
+    },
+    # An adversary acts in these, too; metadata["team"] and metadata["opponents"] say who is who.
     "PhysicalDeception-v0": ("physical_deception_v0", {}),
     "KeepAway-v0": ("keep_away_v0", {}),
     "PredatorPrey-v0": ("predator_prey_v0", {}),
+    # MuJoCo is imported when one of these is created.
+    **{
+        f"Safe{scenario}-{agent_conf}-v0": (
+            "safe_mamujoco_v0",
+            {"scenario": scenario, "agent_conf": agent_conf},
+        )
+        for scenario, agent_conf in (("Ant", "2x4"), ("HalfCheetah", "2x3"))
+    },
 }
 
 
@@ -37,7 +44,7 @@ def _create(env_id: str, **parameters: Any) -> ParallelEnv:
 
 
 def _register() -> None:
-    for env_id, (module, parameters) in (_REGISTRY | _WITH_OPPONENTS).items():
+    for env_id, (module, parameters) in _REGISTRY.items():
         if env_id not in pettingzoo.parallel_registry:
             entry_point = f"{__name__}.{module}:parallel_env"
             pettingzoo.register("parallel", env_id, entry_point, kwargs=parameters)
@@ -47,9 +54,4 @@ _register()
 
 ENV_IDS: dict[str, Callable[..., ParallelEnv]] = {
     env_id: partial(_create, env_id) for env_id in _REGISTRY
-}
-
-# Not among ENV_IDS until the zoo can train them: their agents differ in role and observation size.
-OPPONENT_ENV_IDS: dict[str, Callable[..., ParallelEnv]] = {
-    env_id: partial(_create, env_id) for env_id in _WITH_OPPONENTS
 }

@@ -143,7 +143,7 @@ class ParticleEnv(ParallelEnv[str, np.ndarray, Any]):
         require_render_mode(self.render_mode)
         if self._world is None:
             raise ValueError("render() was called before the first episode; reset first")
-        return picture(self._world)
+        return picture(self._world, self.task)
 
     def close(self) -> None:
         """Forget mpe2's world; mpe2's way to close it would end the pygame of all others, too."""

@@ -54,6 +54,29 @@ class Outcome(NamedTuple):
     truncated: np.ndarray  # (W,) bool
 
 
+_NO_FORCE = -746.0  # exp() of less is exactly zero
+
+
+@_compiled
+def push_by_actions(actions, accelerations, controls):
+    """Write the forces of discrete actions.
+
+    :param actions: 0, ..., 4: nothing, left, right, down, up, shape (W, A)
+    :param accelerations: Shape (A,)
+    :param controls: Shape (W, A, 2), filled with zeros
+    :return: Number of the first agent, counted over all worlds, with another action; else -1
+    """
+    for w in range(actions.shape[0]):
+        for i in range(actions.shape[1]):
+            action = actions[w, i]
+            if action < 0 or action > 4:
+                return w * actions.shape[1] + i
+            if action > 0:
+                sign = -1.0 if action % 2 == 1 else 1.0
+                controls[w, i, (action - 1) // 2] = sign * accelerations[i]
+    return -1
+
+
 @_compiled
 def step_worlds(rules, state, controls, out):
     """Advance every world by one step; writes into the arrays of ``state`` and ``out``.
@@ -109,6 +132,8 @@ def _push(collides, sizes, positions, forces):
                 continue
             distance = _distance(positions, i, j)
             depth = -(distance - (sizes[i] + sizes[j])) / _CONTACT_MARGIN
+            if depth < _NO_FORCE:
+                continue
             # log(1 + exp(depth)), without overflow
             softened = max(depth, 0.0) + math.log1p(math.exp(-abs(depth)))
             for axis in range(2):

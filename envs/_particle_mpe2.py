@@ -7,8 +7,9 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
-from sb3_e2c.envs._particle_config import ParticleConfig
+from sb3_e2c.envs._particle_config import ParticleConfig, ParticleTask
 
 
 class _Replay:
@@ -59,6 +60,16 @@ def restart(world: Any, goal: int, positions: np.ndarray) -> None:
         world.np_random = rng
 
 
-def picture(world: Any) -> np.ndarray:
-    """RGB image of a world as mpe2 draws it, uint8, shape (height, width, 3)."""
-    return np.ascontiguousarray(world.render())
+def picture(world: Any, task: ParticleTask) -> np.ndarray:
+    """RGB image of a world as mpe2 draws it, with who is who, uint8, shape (height, width, 3)."""
+    image = Image.fromarray(np.ascontiguousarray(world.render()))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(size=18)
+    colors = {entity.name: entity.color for entity in world.world.entities}
+    for line, (label, name) in enumerate(
+        (("team", task.team[0]), ("adversary", task.opponents[0]))
+    ):
+        y = 12 + 24 * line
+        # mpe2 draws bodies in 200 times their color
+        draw.ellipse((12, y, 28, y + 16), fill=tuple(int(200 * c) for c in colors[name]))
+        draw.text((36, y - 3), label, fill="black", font=font)
+    return np.array(image)

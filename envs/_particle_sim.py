@@ -9,12 +9,18 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_e2c.envs._particle_config import TASKS, ParticleConfig, Start, draw_start, place
-from sb3_e2c.envs._particle_kernels import Outcome, Rules, State, observe_worlds, step_worlds
+from sb3_e2c.envs._particle_kernels import (
+    Outcome,
+    Rules,
+    State,
+    observe_worlds,
+    push_by_actions,
+    step_worlds,
+)
 
 Grouped = dict[str, np.ndarray]
 Infos = dict[str, dict[str, np.ndarray]]
 
-_DIRECTIONS = np.array([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 _GROUPS = ("team", "opponents")
 
 
@@ -50,7 +56,7 @@ class ParticleSimulator:
         self._action_spaces = action_spaces(config)
         self._rules = tuple(_rules(config))
         bodies = task.bodies[: len(task.agents)]
-        self._accelerations = np.array([[body.acceleration] for body in bodies])
+        self._accelerations = np.array([body.acceleration for body in bodies])
         self._rngs: list[np.random.Generator | None] = [None] * n_worlds
         self._needs_reset = np.ones(n_worlds, dtype=bool)
         self.state = _initial_state(n_worlds, len(task.agents), len(task.bodies))
@@ -158,7 +164,29 @@ class ParticleSimulator:
                     "continuous_actions=True"
                 )
             joint[:, members] = given
-        return to_forces(joint, self.possible_agents) * self._accelerations
+        return self._forces(joint)
+
+    def _forces(self, actions: np.ndarray) -> np.ndarray:
+        """The forces (W, A, 2) of actions (W, A) or (W, A, 5), checked."""
+        controls = np.zeros((*actions.shape[:2], 2))
+        if self.config.continuous_actions:
+            bad = ~np.isfinite(actions).all(axis=-1)
+            first = int(bad.argmax()) if bad.any() else -1
+            inside = np.clip(actions, 0.0, 1.0)
+            directions = inside[..., 2::2] - inside[..., 1::2]
+            np.multiply(directions, self._accelerations[:, None], out=controls)
+        else:
+            first = push_by_actions(actions, self._accelerations, controls)
+        if first >= 0:
+            world, agent = divmod(first, len(self.possible_agents))
+            expected = (
+                "five finite numbers" if self.config.continuous_actions else "one of 0, ..., 4"
+            )
+            raise ValueError(
+                f"the action of {self.possible_agents[agent]} in world {world} is "
+                f"{actions[world, agent].tolist()}; expected {expected}"
+            )
+        return controls
 
     def render(self, world: int = 0) -> np.ndarray:
         """Picture of one world, drawn by mpe2.
@@ -174,7 +202,7 @@ class ParticleSimulator:
         positions = self.state.positions[world]
         for entity, position in zip(painter.world.entities, positions, strict=True):
             entity.state.p_pos = position.copy()
-        return picture(painter)
+        return picture(painter, self.config.task)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -210,22 +238,6 @@ def action_spaces(config: ParticleConfig) -> dict[str, spaces.Space]:
     if config.continuous_actions:
         return {agent: spaces.Box(0.0, 1.0, (5,)) for agent in config.task.agents}
     return {agent: spaces.Discrete(5) for agent in config.task.agents}
-
-
-def to_forces(actions: np.ndarray, agents: Sequence[str]) -> np.ndarray:
-    """Directions (W, A, 2) of integer actions (W, A) or of numbers (W, A, 5), checked."""
-    is_discrete = actions.dtype.kind in "iu"
-    bad = (actions < 0) | (actions > 4) if is_discrete else ~np.isfinite(actions).all(axis=-1)
-    if bad.any():
-        world, agent = np.argwhere(bad)[0]
-        raise ValueError(
-            f"the action of {agents[agent]} in world {world} is {actions[world, agent].tolist()}; "
-            f"expected {'one of 0, ..., 4' if is_discrete else 'five finite numbers'}"
-        )
-    if is_discrete:
-        return _DIRECTIONS[actions]
-    inside = np.clip(actions, 0.0, 1.0)
-    return inside[..., 2::2] - inside[..., 1::2]
 
 
 def _rules(config: ParticleConfig) -> Rules:

@@ -12,7 +12,8 @@ from sb3_e2c.evaluation import TeamEvalCallback, TeamEvaluation, evaluate_team
 from sb3_e2c.mappo import MAPPO
 from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.multipliers import GradientMultipliers, PIDMultipliers
-from sb3_e2c.vec_env import MultiAgentVecEnv, share_parameters
+from sb3_e2c.trust_region import TrustRegionMonitor
+from sb3_e2c.vec_env import MultiAgentVecEnv, OpponentVecEnv, share_parameters
 
 __version__ = "0.1.0"
 
@@ -23,10 +24,12 @@ __all__ = [
     "MultiAgentVecEnv",
     "NearestNeighbor",
     "OEMRewardCallback",
+    "OpponentVecEnv",
     "PIDMultipliers",
     "TeamEvalCallback",
     "TeamEvaluation",
     "TeamMonitor",
+    "TrustRegionMonitor",
     "VisitCount",
     "evaluate_team",
     "share_parameters",

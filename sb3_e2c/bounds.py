@@ -204,18 +204,22 @@ def effective_sample_size(log_ratios: np.ndarray) -> float:
 # Upper bounds of the cost of the new policy
 
 
-def largest_advantage(max_cost: float, gamma: float) -> float:
+def largest_advantage(max_cost: np.ndarray | float, gamma: float) -> np.ndarray | float:
     """A number that no |A| exceeds: ε = c_max / (1 − γ).
 
-    :param max_cost: Largest cost of the team in one step; costs are not negative
+    :param max_cost: Largest cost of the team in one step, scalar or shape (M,); costs are not
+        negative
     :param gamma: Discount γ
-    :return: ε, discounted cost
+    :return: ε, discounted cost, shape of ``max_cost``
     """
     return max_cost / (1 - gamma)
 
 
 def largest_expected_advantage(
-    epsilon: np.ndarray | float, max_joint_kl: float, max_cost: float, gamma: float
+    epsilon: np.ndarray | float,
+    max_joint_kl: float,
+    max_cost: np.ndarray | float,
+    gamma: float,
 ) -> np.ndarray:
     """A number that |E_π̄ A| exceeds in no state (for T1b).
 
@@ -223,7 +227,7 @@ def largest_expected_advantage(
 
     :param epsilon: ε ≥ |A|, scalar or shape (M,)
     :param max_joint_kl: Largest KL of the joint policies in a state, Σᵢ KLᵢ
-    :param max_cost: Largest cost of the team in one step; costs are not negative
+    :param max_cost: Largest cost of the team in one step, scalar or shape (M,)
     :param gamma: Discount γ
     :return: Discounted cost, shape of ``epsilon``
     """

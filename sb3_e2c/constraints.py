@@ -78,10 +78,11 @@ def party_costs(agent_costs: np.ndarray, cost_scope: str, team_cost: str) -> np.
     :param agent_costs: Shape (..., N, M)
     :param cost_scope: "team" or "individual"
     :param team_cost: See :func:`team_costs`
-    :return: Shape (..., K, M)
+    :return: Shape (..., K, M); of one cost that all agents report ("max"), an agent's share is
+        1 / N, so that limits of l / N for each are kept when the team's is
     """
     if cost_scope == "individual":
-        return agent_costs
+        return agent_costs / agent_costs.shape[-2] if team_cost == "max" else agent_costs
     return team_costs(agent_costs, team_cost)[..., None, :]
 
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from sb3_e2c.monitor import (
     team_rewards,
     unwrap_team,
 )
+from sb3_e2c.vec_env import opponent_env
 
 
 @dataclass(frozen=True)
@@ -224,6 +226,7 @@ class TeamEvalCallback(EvalCallback):
             self.eval_env, VecMonitor
         ):
             self.eval_env = TeamMonitor(self.eval_env)
+        _share_opponent(self.training_env, self.eval_env)
         if self.cost_limits is None:
             self.cost_limits = parse_cost_limits(getattr(self.model, "cost_limits", None))
         super()._init_callback()
@@ -233,7 +236,8 @@ class TeamEvalCallback(EvalCallback):
             return True
         evaluation = self._evaluate()
         if self.log_path is not None:
-            self._save(evaluation)
+            self._keep(evaluation)
+            self.write_evaluations()
         self._log(evaluation)
         continue_training = self._keep_best(evaluation)
         if self.callback is not None:
@@ -260,14 +264,23 @@ class TeamEvalCallback(EvalCallback):
                 callback=self._log_success_callback,
             )
 
-    def _save(self, evaluation: TeamEvaluation) -> None:
+    def _keep(self, evaluation: TeamEvaluation) -> None:
         self.evaluations_timesteps.append(self.num_timesteps)
         self.evaluations_results.append(evaluation.returns.tolist())
         self.evaluations_length.append(evaluation.lengths.tolist())
         self.evaluations_costs.append(evaluation.costs)
-        successes = {}
         if self._is_success_buffer:
             self.evaluations_successes.append(self._is_success_buffer)
+
+    def write_evaluations(self) -> None:
+        """Write ``evaluations.npz`` from all evaluations so far; nothing without ``log_path``."""
+        if self.log_path is None:
+            return
+        if not self.evaluations_timesteps:
+            Path(f"{self.log_path}.npz").unlink(missing_ok=True)
+            return
+        successes = {}
+        if self.evaluations_successes:
             successes = {"successes": self.evaluations_successes}
         # A run that is killed while it writes keeps the file of the evaluation before.
         np.savez(
@@ -329,3 +342,12 @@ class TeamEvalCallback(EvalCallback):
 
     def _has_limits(self) -> bool:
         return self.cost_limits is not None and len(self.cost_limits) > 0
+
+
+def _share_opponent(training_env: VecEnv, eval_env: VecEnv) -> None:
+    """Let who acts for the opponents in training act in evaluations, unless another was chosen."""
+    source, target = opponent_env(training_env), opponent_env(eval_env)
+    if source is None or target is None or target.chosen:
+        return
+    if source.opponent is not None:
+        target.attach(source.opponent)

@@ -13,7 +13,7 @@ K constrained parties (1: the team, N: each agent), M constraints.
 
 import pathlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -41,13 +41,14 @@ from sb3_e2c.constraints import (
 from sb3_e2c.losses import approx_kl, clip_fraction, normalize, policy_loss, value_loss
 from sb3_e2c.monitor import named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
+from sb3_e2c.opponents import adversary_path, load_learner
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory, Sequences
 from sb3_e2c.teams import check_counts, check_subclass, check_team, monitored, team_of
-from sb3_e2c.vec_env import share_parameters
+from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
 
@@ -83,6 +84,8 @@ class MAPPO(PPO):
     :param critic_learning_rate: Of all critics, also as a schedule; None: ``learning_rate``
     :param normalize_values: Standardize the targets of the critics by their running mean and
         standard deviation, for the reward and each cost separately
+    :param opponent_kwargs: Arguments in which the opponents' model differs from the team's, in an
+        :class:`sb3_e2c.OpponentVecEnv` whose opponents learn; it never has limits or a bonus
     :raises ValueError: for limits or a scope that make no sense, or a batch smaller than a team
     """
 
@@ -90,11 +93,23 @@ class MAPPO(PPO):
         "MlpPolicy": TeamPolicy,
         "GruPolicy": GruPolicy,
     }
+    # What the model of opponents takes over from the team, unless opponent_kwargs say otherwise
+    opponent_arguments: ClassVar[frozenset[str]] = frozenset(
+        (
+            *("policy", "policy_kwargs", "learning_rate", "critic_learning_rate", "batch_size"),
+            *("n_epochs", "gamma", "gae_lambda", "clip_range", "clip_range_vf", "target_kl"),
+            *("normalize_advantage", "normalize_values", "ent_coef", "vf_coef", "max_grad_norm"),
+            *("reward_scale", "device"),
+        )
+    )
     policy: TeamPolicy
     rollout_buffer: TeamRolloutBuffer
     multipliers: Multipliers
     clip_range: FloatSchedule
     clip_range_vf: FloatSchedule | None
+    # Asked after every epoch whether the update ends there; TrustRegionMonitor sets it.
+    stop_epochs: Callable[[], bool] | None = None
+    _log_interval = 1
 
     def __init__(
         self,
@@ -120,6 +135,7 @@ class MAPPO(PPO):
         reward_scale: float = 1.0,
         critic_learning_rate: float | Schedule | None = None,
         normalize_values: bool = False,
+        opponent_kwargs: dict[str, Any] | None = None,
         target_kl: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -137,6 +153,9 @@ class MAPPO(PPO):
         self.reward_scale = reward_scale
         self.critic_learning_rate = critic_learning_rate
         self.normalize_values = normalize_values
+        self.opponent_kwargs = opponent_kwargs or {}
+        self.opponent: MAPPO | None = None  # the model of opponents that learn beside the team
+        self._adversary_file: pathlib.Path | None = None  # where load() found it, not read yet
         # PPO's own constructor would only add checks on minibatches of rows, which are not ours.
         OnPolicyAlgorithm.__init__(
             self,
@@ -213,6 +232,40 @@ class MAPPO(PPO):
         shape = (parties, len(self.cost_limits))
         self.multipliers = self.multipliers_class(shape, **self.multipliers_kwargs).to(self.device)
         self._party_limits = party_limits(self.cost_limits, parties)
+        self._attach_opponent()
+
+    def _attach_opponent(self) -> None:
+        """Let the opponents' model learn beside the team, if nobody was chosen to act for them."""
+        env = opponent_env(self.env)
+        if env is None or env.chosen:
+            return
+        if self.opponent is None:
+            self.opponent = self.new_opponent(env)
+            if self._adversary_file is not None:
+                load_learner(self.opponent, self._adversary_file)
+        if env.opponent is not self.opponent:
+            env.attach(self.opponent, learning=True)
+
+    def new_opponent(self, env: OpponentVecEnv) -> "MAPPO":
+        """An untrained model for the opponents: networks and settings of the team, but no limits.
+
+        :param env: Where they act
+        :return: A model with the team's arguments and ``opponent_kwargs``
+        """
+        own = self.opponent_arguments
+        if not set(self.opponent_kwargs) <= own:
+            raise ValueError(
+                f"opponent_kwargs has {sorted(set(self.opponent_kwargs) - own)}; expected only "
+                f"arguments in which opponents may differ from the team: {sorted(own)}"
+            )
+        kwargs = {name: getattr(self, name) for name in own - {"policy"}}
+        kwargs = {"policy": self.policy_class, **kwargs, **self.opponent_kwargs}
+        model = MAPPO(env=None, n_steps=self.n_steps, _init_setup_model=False, **kwargs)
+        side = env.opponents
+        model.observation_space, model.action_space = side.observation_space, side.action_space
+        model.agents, model.n_envs = list(side.agents), env.n_worlds * len(side.agents)
+        model._setup_model()
+        return model
 
     def _setup_schedules(self) -> None:
         self.clip_range = FloatSchedule(self.clip_range)
@@ -239,30 +292,23 @@ class MAPPO(PPO):
         check_team(env, self.agents, self.critic_state_dim)
         super().set_env(env, force_reset)
         self._recorder = None
+        self._attach_opponent()
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+        self._attach_opponent()
         last_obs = self._last_obs
         result = super()._setup_learn(total_timesteps, *args, **kwargs)
         if self._recorder is None or self._last_obs is not last_obs:  # the environment was reset
-            self._start_episodes()
+            env = self.env
+            assert env is not None
+            assert self._last_obs is not None
+            reset_infos = env.unwrapped.reset_infos
+            team_cost = getattr(env, "team_cost", "sum")
+            self.start_episodes(self._last_obs, reset_infos, team_cost)  # type: ignore[arg-type]
         if self.verbose >= 1:
             extra = f"and {self.critic_state_dim} numbers of info['critic_state']"
             print(f"Critics see the joint observation {extra if self.critic_state_dim else 'only'}")
         return result
-
-    def _start_episodes(self) -> None:
-        env = self.env
-        assert env is not None
-        self._recorder = TeamRecorder(
-            self.agents,
-            n_worlds=env.num_envs // self.n_agents,
-            n_constraints=len(self.cost_limits),
-            cost_scope=self.cost_scope,
-            team_cost=getattr(env, "team_cost", "sum"),
-            critic_state_dim=self.critic_state_dim,
-        )
-        self._recorder.start(self._last_obs, env.unwrapped.reset_infos)  # type: ignore[arg-type]
-        self._memory = self.policy.empty_memory(env.num_envs // self.n_agents)
 
     # ------------------------------------------------------------------ collecting
 
@@ -287,17 +333,13 @@ class MAPPO(PPO):
         :return: False if a callback stopped the training
         """
         assert self._last_obs is not None, "no previous observation: learn() resets first"
-        self.policy.set_training_mode(False)
-        self._memory = self._running(self._memory, self._last_episode_starts)
-        rollout_buffer.reset(self._memory if self.policy.recurrent else None)
-        states = self._memory.actor.flatten(0, 1)
-        recorder = self._recorder
-        assert recorder is not None, "learn() makes the recorder"
-        recorder.finished_costs.clear()
+        self.begin_rollout()
+        opponents = opponent_env(env)
+        if opponents is not None and opponents.learner is not None:
+            opponents.learner.begin_rollout(n_rollout_steps)
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
-            actions, states = self._sample_actions(self._last_obs, states)
-            clipped_actions = self._clip_actions(actions)
+            actions, clipped_actions = self.act()
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             assert isinstance(new_obs, np.ndarray)
             rewards = self.reward_scale * rewards
@@ -305,27 +347,102 @@ class MAPPO(PPO):
             callback.update_locals(locals())
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
-            recorder.record(
-                rollout_buffer,
-                last_obs=self._last_obs,  # type: ignore[arg-type]
-                episode_starts=self._last_episode_starts,  # type: ignore[arg-type]
-                actions=actions,
-                rewards=rewards,
-                new_obs=new_obs,
-                dones=dones,
-                infos=infos,
-                reset_infos=env.unwrapped.reset_infos,
-            )
-            self._last_obs, self._last_episode_starts = new_obs, dones
+            self.record(actions, rewards, new_obs, dones, infos, env.unwrapped.reset_infos)
             if not go_on:  # only now: a later learn() may continue the running episodes
-                self._memory = Memory(states.view_as(self._memory.actor), *self._memory[1:])
                 return False
-        last_obs = np.asarray(self._last_obs)
-        critics = rollout_buffer.finish(self.policy, last_obs, recorder.critic_states)
-        self._memory = Memory(states.view_as(self._memory.actor), *critics)
+        self.finish_rollout()
+        if opponents is not None and opponents.learner is not None:
+            opponents.learner.finish_rollout(self.logger)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    # What `collect_rollouts` does for a team, somebody who has stepped the environment can do for
+    # others in it: see LearningOpponents.
+
+    def start_episodes(
+        self,
+        observations: np.ndarray,
+        reset_infos: Sequence[dict[str, Any]],
+        team_cost: str = "sum",
+    ) -> None:
+        """Begin anew after a reset of all worlds.
+
+        :param observations: Shape (S, D)
+        :param reset_infos: One dict for each slot
+        :param team_cost: How the costs of agents make the team's, "sum" or "max"
+        """
+        n_worlds = len(observations) // self.n_agents
+        self._recorder = TeamRecorder(
+            self.agents,
+            n_worlds=n_worlds,
+            n_constraints=len(self.cost_limits),
+            cost_scope=self.cost_scope,
+            team_cost=team_cost,
+            critic_state_dim=self.critic_state_dim,
+        )
+        self._recorder.start(observations, reset_infos)
+        self._last_obs = observations
+        self._last_episode_starts = np.ones(len(observations), bool)
+        self._memory = self.policy.empty_memory(n_worlds)
+
+    def begin_rollout(self) -> None:
+        """Forget the last rollout; running episodes go on."""
+        assert self._recorder is not None, "start_episodes() makes the recorder"
+        self.policy.set_training_mode(False)
+        self._memory = self._running(self._memory, self._last_episode_starts)
+        self.rollout_buffer.reset(self._memory if self.policy.recurrent else None)
+        self._recorder.finished_costs.clear()
+
+    def act(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sample actions of all slots on the last observations.
+
+        :return: The actions, and what the environment accepts of them, shapes (S, ...)
+        """
+        states = self._memory.actor.flatten(0, 1)
+        actions, states = self._sample_actions(self._last_obs, states)
+        self._memory = self._memory._replace(actor=states.view_as(self._memory.actor))
+        return actions, self._clip_actions(actions)
+
+    def record(
+        self,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        new_obs: np.ndarray,
+        dones: np.ndarray,
+        infos: Sequence[dict[str, Any]],
+        reset_infos: Sequence[dict[str, Any]],
+    ) -> None:
+        """Store what came of the last actions.
+
+        :param actions: As :meth:`act` gave them, shape (S, ...)
+        :param rewards: Shape (S,)
+        :param new_obs: Shape (S, D)
+        :param dones: Whether the step ended an episode, shape (S,)
+        :param infos: One dict for each slot
+        :param reset_infos: One dict for each slot, new where an episode ended
+        """
+        assert self._recorder is not None, "start_episodes() makes the recorder"
+        self._recorder.record(
+            self.rollout_buffer,
+            last_obs=self._last_obs,  # type: ignore[arg-type]
+            episode_starts=self._last_episode_starts,  # type: ignore[arg-type]
+            actions=actions,
+            rewards=rewards,
+            new_obs=new_obs,
+            dones=dones,
+            infos=infos,
+            reset_infos=reset_infos,
+        )
+        self._last_obs, self._last_episode_starts = new_obs, dones
+
+    def finish_rollout(self) -> None:
+        """Evaluate all networks on the rollout and compute the advantages."""
+        assert self._recorder is not None, "start_episodes() makes the recorder"
+        critics = self.rollout_buffer.finish(
+            self.policy, np.asarray(self._last_obs), self._recorder.critic_states
+        )
+        self._memory = Memory(self._memory.actor, *critics)
 
     def _sample_actions(self, obs: Any, states: th.Tensor) -> tuple[np.ndarray, th.Tensor]:
         """Actions, and the actor's next hidden states, of all slots."""
@@ -356,6 +473,7 @@ class MAPPO(PPO):
 
     def train(self) -> None:
         """Update multipliers, policy and critics from the last rollout (Alg. 2 l. 11-16)."""
+        self._train_opponent()
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         self._update_multipliers()  # l. 11
@@ -371,7 +489,14 @@ class MAPPO(PPO):
                 if self.verbose >= 1:
                     print(f"Early stopping at epoch {epoch}: KL {logs['approx_kl'][-1]:.4f}")
                 break
+            if self.stop_epochs is not None and self.stop_epochs():
+                break
         self._log_training(logs)
+
+    def _train_opponent(self) -> None:
+        env = opponent_env(self.env)
+        if env is not None and env.learner is not None:
+            env.learner.train(self._current_progress_remaining)
 
     def _train_epoch(self, samples: TeamSamples, logs: dict[str, list[float]]) -> bool:
         """One pass over the rollout (Alg. 2 l. 13-16).
@@ -499,6 +624,11 @@ class MAPPO(PPO):
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write the log; adds the episode costs and the number of environment steps."""
+        if iteration > 0:  # counted here, because a resumed run goes on counting
+            done = self.num_timesteps - self._num_timesteps_at_start
+            iteration = done // (self.n_steps * self.n_envs)
+            if iteration % self._log_interval != 0:
+                return
         assert self.ep_info_buffer is not None
         if self.ep_info_buffer:
             for key in [key for key in self.ep_info_buffer[0] if key.startswith("cost")]:
@@ -518,15 +648,23 @@ class MAPPO(PPO):
     ) -> "MAPPO":
         """Train until that many agent steps are done; see ``PPO.learn``."""
         name = tb_log_name or type(self).__name__
+        self._log_interval = log_interval or 1
+        every = None if log_interval is None else 1  # dump_logs() passes over the others
         return super().learn(
-            total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar
+            total_timesteps,
+            callback,
+            every,
+            name,
+            reset_num_timesteps,
+            progress_bar,
         )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "multipliers"], []
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_recorder", "_memory"]
+        own = ("_recorder", "_memory", "stop_epochs", "opponent", "_adversary_file")
+        return [*super()._excluded_save_params(), *own]
 
     def save(
         self,
@@ -536,7 +674,10 @@ class MAPPO(PPO):
     ) -> None:
         """Save everything that learns to a zip file, so that a crash never leaves half a file.
 
-        :param path: Where to save; ".zip" is added if there is no suffix. Or an open file
+        The model that acts for opponents goes to a file beside it: "team.adversary.zip".
+
+        :param path: Where to save; ".zip" is added if there is no suffix. Or an open file, which
+            holds no adversary
         :param exclude: Names of parameters to leave out besides the default ones
         :param include: Names of parameters that the default would leave out
         """
@@ -544,5 +685,38 @@ class MAPPO(PPO):
             super().save(path, exclude, include)
             return
         target = pathlib.Path(path)
-        with atomic_write(target if target.suffix else target.with_suffix(".zip")) as file:
+        target = target if target.suffix else target.with_suffix(".zip")
+        self._save_opponent(adversary_path(target))  # first: a team is never without it
+        with atomic_write(target) as file:
             super().save(file, exclude, include)  # type: ignore[arg-type]
+
+    def _save_opponent(self, path: pathlib.Path) -> None:
+        env, unread = opponent_env(self.env), self._adversary_file
+        opponent = self.opponent if env is None else env.opponent
+        if isinstance(opponent, MAPPO):
+            opponent.save(path)
+        elif env is None and unread is not None and unread.exists():
+            content = unread.read_bytes()
+            with atomic_write(path) as file:
+                file.write(content)
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path | Any, env: Any = None, **kwargs: Any) -> "MAPPO":  # type: ignore[override]
+        """Load a model; see ``PPO.load``.
+
+        In an :class:`sb3_e2c.OpponentVecEnv` for which nobody was chosen to act, the adversary
+        that was saved beside the team goes on to learn beside it.
+
+        :param path: What ``save`` was given
+        :param env: Where to go on
+        :param kwargs: Of ``PPO.load``
+        :raises FileNotFoundError: If there is no adversary beside the model
+        """
+        model = super().load(path, env, **kwargs)
+        in_a_file = isinstance(path, (str, pathlib.Path))
+        beside = adversary_path(path) if in_a_file else pathlib.Path("an open file")
+        if model.opponent is not None:
+            load_learner(model.opponent, beside)
+        elif in_a_file:  # a later set_env() may need it
+            model._adversary_file = beside
+        return model

@@ -1,10 +1,11 @@
 """Statistics of whole teams: one record for each world's episode, not one for each agent's."""
 
+import os
 import time
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -24,17 +25,23 @@ class TeamMonitor(VecMonitor):
         below has scaled are counted unscaled
     :param filename: csv file with one row for each record, begun at the first one
     :param info_keywords: further keys of the first slot's last info to record
+    :param override_existing: whether to begin the file anew, or to append to what it holds
     """
 
     episode_costs: np.ndarray | None  # shape (W, M), None before the first infos tell M
 
     def __init__(
-        self, venv: VecEnv, filename: str | None = None, info_keywords: tuple[str, ...] = ()
+        self,
+        venv: VecEnv,
+        filename: str | None = None,
+        info_keywords: tuple[str, ...] = (),
+        override_existing: bool = True,
     ):
         self._team = unwrap_team(venv, "TeamMonitor")
         # The columns depend on the number of costs, which the first infos tell.
         super().__init__(venv, None, info_keywords)
-        self._filename = filename
+        self._filename = None if filename is None else _csv_path(filename)
+        self._override_existing = override_existing
         self._start_episodes()
 
     def reset(self) -> VecEnvObs:
@@ -82,11 +89,26 @@ class TeamMonitor(VecMonitor):
         if self._filename is not None and self.results_writer is None:
             name = str(self._team.metadata.get("name"))
             header: dict[str, float | str] = {"t_start": self.t_start, "env_id": name}
+            anew = self._override_existing or not os.path.exists(self._filename)
             self.results_writer = ResultsWriter(
-                self._filename, header=header, extra_keys=tuple(record)[3:]
+                self._filename,
+                header=header,
+                extra_keys=tuple(record)[3:],
+                override_existing=anew,
             )
         if self.results_writer is not None:
             self.results_writer.write_row(record)
+
+
+def _csv_path(filename: str) -> str:
+    """The file that SB3's ``ResultsWriter`` makes of a name."""
+    if filename.endswith(Monitor.EXT):
+        return filename
+    return (
+        os.path.join(filename, Monitor.EXT)
+        if os.path.isdir(filename)
+        else f"{filename}.{Monitor.EXT}"
+    )
 
 
 def unwrap_team(env: Any, user: str) -> MultiAgentVecEnv:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
@@ -328,8 +328,8 @@ class TeamPolicy(ActorCriticPolicy):
         :param states: Hidden states of the actor, shape (S, H)
         :return: Actions (S, ...), and the next hidden states
         """
-        features = super().extract_features(obs, self.pi_features_extractor)
-        assert isinstance(features, th.Tensor)
+        # ActorCriticPolicy's own would also run the critics' extractor, if they have one.
+        features = BasePolicy.extract_features(self, obs, self.pi_features_extractor)
         return self._sample(self.mlp_extractor.forward_actor(features)), states
 
     def _sample(self, latent_pi: th.Tensor) -> th.Tensor:

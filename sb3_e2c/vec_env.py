@@ -5,6 +5,7 @@ W worlds of N agents become S = W·N slots with slot = world·N + agent, so that
 
     ParallelEnv ─► worlds.World ─► SuperSuit's rows ─► worlds.SuperSuitWorlds ─┐
     ParallelEnv.batched(W) ──────────────────────────► worlds.BatchedWorlds ───┴─► MultiAgentVecEnv
+    with opponents, both ways: sides.Sides ─► opponents.OpponentWorlds ──────────► OpponentVecEnv
 
 Both ways give the same trajectories for the same seeds. SuperSuit's own adapter to
 Stable-Baselines3 is not used, because it loses seeds, time limits and the infos of an
@@ -26,8 +27,25 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from sb3_e2c.constraints import TeamCost
-from sb3_e2c.world import MakeEnv, new_env
-from sb3_e2c.worlds import BatchedWorlds, SuperSuitWorlds, WorkerWorlds, Worlds
+from sb3_e2c.opponents import (
+    LearningOpponents,
+    Opponent,
+    Opponents,
+    OpponentWorlds,
+    RandomOpponents,
+    TrainedOpponents,
+    check_fits,
+    check_learns,
+)
+from sb3_e2c.sides import Side, make_sides
+from sb3_e2c.world import MakeEnv, new_env, split_agents
+from sb3_e2c.worlds import (
+    BatchedWorlds,
+    SuperSuitWorlds,
+    WorkerWorlds,
+    Worlds,
+    close_episodes,
+)
 
 Backend = Literal["auto", "supersuit", "batched"]
 TeamReturn = Literal["shared", "sum"]
@@ -41,8 +59,9 @@ def share_parameters(
     backend: Backend = "auto",
     team_return: TeamReturn | None = None,
     team_cost: TeamCost | None = None,
+    team: Sequence[str] | None = None,
 ) -> "MultiAgentVecEnv":
-    """Make the worlds and give each of their agents a row, so that all share one policy.
+    """Make the worlds and give each agent of the team a row, so that all share one policy.
 
     One environment is made and reset first to look at its agents, spaces and infos.
 
@@ -57,22 +76,39 @@ def share_parameters(
         the sum over its agents; None reads ``env.metadata["team_return"]``, else "sum"
     :param team_cost: "sum" over the agents or "max" if all report one cost; None reads
         ``env.metadata["team_cost"]``, else "sum"
-    :return: S = W·N slots
+    :param team: names of the agents that are trained; None reads ``env.metadata["team"]``, else
+        all. If there are others, they are opponents and the result is an :class:`OpponentVecEnv`
+    :return: S = W·N slots, N being the size of the team
     """
     _check_request(make_env, n_worlds, n_processes, backend, seed)
     example = new_env(make_env)
-    critic_state_dim = _critic_state_dim(example)
-    worlds: Worlds
-    if _is_batched(example, backend, n_processes):
-        worlds = BatchedWorlds(example.batched(n_worlds))
-    elif n_processes == 1:
-        others = [new_env(make_env) for _ in range(n_worlds - 1)]
-        worlds = SuperSuitWorlds([example, *others])
+    members, opponents = split_agents(example, team)
+    critic_state_dim = _critic_state_dim(example, members[0])
+    rules = (critic_state_dim, team_return, team_cost)
+    env: MultiAgentVecEnv
+    if opponents:
+        agents = (members, opponents)
+        batched = _has_simulator(example, backend, n_processes, agents)
+        sides = make_sides(make_env, example, agents, n_worlds, n_processes, batched)
+        env = OpponentVecEnv(OpponentWorlds(sides), *rules)
     else:
-        worlds = WorkerWorlds(make_env, [example, new_env(make_env)], n_worlds, n_processes)
-    env = MultiAgentVecEnv(worlds, critic_state_dim, team_return, team_cost)
+        batched = _has_simulator(example, backend, n_processes)
+        env = MultiAgentVecEnv(
+            _make_worlds(make_env, example, n_worlds, n_processes, batched), *rules
+        )
     env.seed(seed)
     return env
+
+
+def _make_worlds(
+    make_env: MakeEnv, example: Any, n_worlds: int, n_processes: int, batched: bool
+) -> Worlds:
+    if batched:
+        return BatchedWorlds(example.batched(n_worlds))
+    if n_processes == 1:
+        others = [new_env(make_env) for _ in range(n_worlds - 1)]
+        return SuperSuitWorlds([example, *others])
+    return WorkerWorlds(make_env, [example, new_env(make_env)], n_worlds, n_processes)
 
 
 class MultiAgentVecEnv(VecEnv):
@@ -163,10 +199,7 @@ class MultiAgentVecEnv(VecEnv):
         :return: observations (S, ...), rewards (S,), dones (S,) and infos (S,)
         """
         step = self.worlds.step_wait()
-        dones = step.terminated | step.truncated
-        timeouts = step.truncated & ~step.terminated
-        for slot in np.flatnonzero(dones).tolist():
-            step.infos[slot]["TimeLimit.truncated"] = bool(timeouts[slot])
+        dones = close_episodes(step)
         for slot, info in step.reset_infos.items():
             self.reset_infos[slot] = info
         return step.observations, step.rewards, dones, step.infos
@@ -199,7 +232,7 @@ class MultiAgentVecEnv(VecEnv):
         """Set an attribute of the slots' worlds; see ``VecEnv.set_attr``."""
         slots = list(self._get_indices(indices))
         n_named = len({slot // self.n_agents for slot in slots})
-        if isinstance(self.worlds, BatchedWorlds) and n_named != self.n_worlds:
+        if self.worlds.shared_owner and n_named != self.n_worlds:
             raise ValueError(
                 f"set_attr({attr_name!r}) names {n_named} of {self.n_worlds} worlds, but batched "
                 "worlds share their attributes; set it for all, or use backend='supersuit'"
@@ -239,22 +272,118 @@ class MultiAgentVecEnv(VecEnv):
             raise RuntimeError(f"this MultiAgentVecEnv is {state}; make a new one")
 
 
-def _is_batched(env: ParallelEnv, backend: Backend, n_processes: int) -> bool:
+class OpponentVecEnv(MultiAgentVecEnv):
+    """Worlds in which others act beside the team; made by :func:`share_parameters`.
+
+    Only the team has slots. Somebody must be chosen to act for the opponents: ``MAPPO`` gives
+    them a model of their own that learns beside the team, unless :meth:`set_opponent` was called.
+
+    :param worlds: the team's slots
+    :param critic_state_dim: see :class:`MultiAgentVecEnv`
+    :param team_return: see :func:`share_parameters`
+    :param team_cost: see :func:`share_parameters`
+    """
+
+    worlds: OpponentWorlds
+
+    def __init__(
+        self,
+        worlds: OpponentWorlds,
+        critic_state_dim: int = 0,
+        team_return: TeamReturn | None = None,
+        team_cost: TeamCost | None = None,
+    ):
+        super().__init__(worlds, critic_state_dim, team_return, team_cost)
+        self.opponent: Opponent | None = None
+        self.chosen = False  # whether by set_opponent, and not by an algorithm or an evaluation
+
+    @property
+    def opponents(self) -> Side:
+        """Names and spaces of the opponents."""
+        return self.worlds.sides.opponents
+
+    @property
+    def learner(self) -> LearningOpponents | None:
+        """Who learns for the opponents, if anybody does."""
+        acting = self.worlds.opponents
+        return acting if isinstance(acting, LearningOpponents) else None
+
+    def set_opponent(
+        self, opponent: Opponent, learning: bool = False, deterministic: bool = False
+    ) -> None:
+        """Choose who acts for the opponents, from the next step on.
+
+        :param opponent: "random", or a model with Stable-Baselines3's ``predict`` that fits their
+            spaces, such as ``model.opponent`` of a trained team
+        :param learning: whether it learns beside the team; it must come from
+            ``MAPPO.new_opponent``, and a ``MAPPO`` must train the team
+        :param deterministic: whether it takes the most likely actions; never while it learns
+        """
+        self.attach(opponent, learning, deterministic)
+        self.chosen = True
+
+    def attach(
+        self, opponent: Opponent, learning: bool = False, deterministic: bool = False
+    ) -> None:
+        """Let somebody act as long as nobody is chosen; for algorithms and evaluations.
+
+        :param opponent: see :meth:`set_opponent`
+        :param learning: see :meth:`set_opponent`
+        :param deterministic: see :meth:`set_opponent`
+        """
+        acting: Opponents
+        if isinstance(opponent, str):
+            if opponent != "random" or learning:
+                kind = "a model that learns" if learning else "'random' or a model"
+                raise ValueError(f"opponent is {opponent!r}; expected {kind}")
+            acting = RandomOpponents(self.opponents, self.n_worlds)
+        elif not hasattr(opponent, "predict"):
+            raise TypeError(f"opponent is {opponent!r}; expected 'random' or a model")
+        elif learning:
+            check_learns(opponent, self.opponents, self.n_worlds)
+            acting = LearningOpponents(self.opponents, self.n_worlds, opponent)
+        else:
+            check_fits(opponent, self.opponents)
+            acting = TrainedOpponents(self.opponents, self.n_worlds, opponent, deterministic)
+        self.opponent = opponent
+        self.worlds.let_act(acting)
+
+
+def opponent_env(env: Any) -> OpponentVecEnv | None:
+    """The environment with opponents below all wrappers, if it has any.
+
+    :param env: given by the user
+    """
+    flat = env.unwrapped if isinstance(env, VecEnv) else None
+    return flat if isinstance(flat, OpponentVecEnv) else None
+
+
+def _has_simulator(
+    env: ParallelEnv,
+    backend: Backend,
+    n_processes: int,
+    sides: tuple[list[str], list[str]] | None = None,
+) -> bool:
     """Whether to use the environment's batched simulator."""
     # Of the class itself: a wrapper passes its environment's method on, and would be left out.
-    offered = callable(getattr(type(env), "batched", None))
+    method = "batched" if sides is None else "batched_groups"
+    offered = callable(getattr(type(env), method, None))
+    if offered and sides is not None:  # its groups are the environment's own
+        offered = split_agents(env, None) == sides
     if backend == "batched" and not offered:
+        whose = "" if sides is None else f" for the team {sides[0]}"
         raise ValueError(
-            f"backend is 'batched', but {type(env).__name__} has no method batched(n_worlds); "
-            "expected an environment that defines it, without wrappers. Use backend='supersuit'"
+            f"backend is 'batched', but {type(env).__name__} has no method {method}(n_worlds)"
+            f"{whose}; expected an environment that defines it, without wrappers. Use "
+            "backend='supersuit'"
         )
     return offered and backend != "supersuit" and n_processes == 1
 
 
-def _critic_state_dim(env: ParallelEnv) -> int:
+def _critic_state_dim(env: ParallelEnv, agent: str) -> int:
     """Size of ``info["critic_state"]``, 0 where there is none."""
     _, infos = env.reset(seed=0)
-    state = infos.get(env.possible_agents[0], {}).get("critic_state", ())
+    state = infos.get(agent, {}).get("critic_state", ())
     if np.ndim(state) != 1:
         raise ValueError(
             f"info['critic_state'] has shape {np.shape(state)}; expected one dimension, flatten it"

@@ -1,6 +1,6 @@
 """One world as SuperSuit needs it, and what an environment must be like to become one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -22,18 +22,29 @@ class World(BaseParallelWrapper):
 
     :param env: environment whose agents all end in the same step
     :param index: number of the world
+    :raises ValueError: if its agents cannot share one policy
     """
 
     def __init__(self, env: ParallelEnv, index: int):
         super().__init__(env)
         self.index = index
-        self.possible_agents = list(env.possible_agents)
-        self.agents = list(env.possible_agents)  # SuperSuit resets before it looks again
+        self.possible_agents = self._order(list(env.possible_agents))
+        self.agents = list(self.possible_agents)  # SuperSuit resets before it looks again
         self.metadata = getattr(env, "metadata", {})
         # Multi-agent MuJoCo keeps the mode in the robot's environment only.
         robot = getattr(env.unwrapped, "single_agent_env", None)
         self.render_mode = getattr(env, "render_mode", None) or getattr(robot, "render_mode", None)
-        self._space = as_float32(env.observation_space(self.agents[0]))
+        self._space, self._action_space = self._common_spaces()
+
+    def _order(self, agents: list[str]) -> list[str]:
+        """The order of the rows."""
+        return agents
+
+    def _common_spaces(self) -> tuple[spaces.Space, spaces.Space]:
+        """Observation and action space of every row."""
+        check_spaces(self.env, self.agents)
+        first = self.agents[0]
+        return as_float32(self.env.observation_space(first)), self.env.action_space(first)
 
     @property
     @override
@@ -44,6 +55,10 @@ class World(BaseParallelWrapper):
     @override
     def observation_space(self, agent: str) -> spaces.Space:
         return self._space
+
+    @override
+    def action_space(self, agent: str) -> spaces.Space:
+        return self._action_space
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -110,10 +125,10 @@ def as_float32(space: spaces.Space) -> spaces.Space:
 
 
 def new_env(make_env: MakeEnv) -> Any:
-    """Make an environment and check that its agents can share one policy.
+    """Make an environment and check that it is of the right kind.
 
     :param make_env: given by the user
-    :return: a ``ParallelEnv`` whose agents have equal spaces
+    :return: a ``ParallelEnv`` that names its agents
     """
     env = make_env()
     hint = ""
@@ -131,22 +146,43 @@ def new_env(make_env: MakeEnv) -> Any:
             f"{type(env).__name__} has no possible_agents; expected a list of all agents that ever "
             "act, in a fixed order"
         )
-    _check_spaces(env, env.observation_space, "observation", "pad_observations_v0")
-    _check_spaces(env, env.action_space, "action", "pad_action_space_v0")
     return env
 
 
-def _check_spaces(
-    env: ParallelEnv, space: Callable[[str], spaces.Space], kind: str, padding: str
-) -> None:
-    first = env.possible_agents[0]
-    for agent in env.possible_agents[1:]:
-        if space(agent) != space(first):
-            raise ValueError(
-                f"the agents {first!r} and {agent!r} have different {kind} spaces, {space(first)} "
-                f"and {space(agent)}; expected equal ones, because all agents share one policy. "
-                f"Pad them, for example with supersuit.{padding}"
-            )
+def check_spaces(env: ParallelEnv, agents: Sequence[str]) -> None:
+    """Refuse agents with different spaces, because one policy acts for all of them.
+
+    :param env: knows their spaces
+    :param agents: names of those that shall share a policy
+    """
+    kinds = (
+        (env.observation_space, "observation", "pad_observations_v0"),
+        (env.action_space, "action", "pad_action_space_v0"),
+    )
+    for space, kind, padding in kinds:
+        for agent in agents[1:]:
+            if space(agent) != space(agents[0]):
+                raise ValueError(
+                    f"the agents {agents[0]!r} and {agent!r} have different {kind} spaces, "
+                    f"{space(agents[0])} and {space(agent)}; expected equal ones, because they "
+                    f"share one policy. Pad them, for example with supersuit.{padding}, or say "
+                    "which agents are the team: share_parameters(..., team=[...])"
+                )
+
+
+def split_agents(env: ParallelEnv, team: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """Who belongs to the team, and who are its opponents.
+
+    :param env: its ``metadata["team"]`` is the default
+    :param team: names of the team's agents, or None
+    :return: the names of both sides in the environment's order; the second may be empty
+    """
+    everyone = list(env.possible_agents)
+    if team is None:
+        team = getattr(env, "metadata", {}).get("team", everyone)
+    if isinstance(team, str) or not team or not set(team) <= set(everyone):
+        raise ValueError(f"team is {team!r}; expected a list of some of the agents {everyone}")
+    return [a for a in everyone if a in team], [a for a in everyone if a not in team]
 
 
 def check_distinct(envs: list[ParallelEnv]) -> None:

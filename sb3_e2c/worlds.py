@@ -29,6 +29,7 @@ from typing_extensions import override
 from sb3_e2c.world import RESET_INFO, MakeEnv, World, as_float32, check_distinct, new_env
 
 Infos = list[dict[str, Any]]
+NewWorld = Callable[[ParallelEnv, int], World]
 
 # Patience with worlds that are being closed; then their workers are killed.
 _CLOSE_SECONDS = 5.0
@@ -95,6 +96,7 @@ class Worlds(ABC):
     """
 
     failed = False
+    shared_owner = False  # whether one object holds the attributes of all worlds
 
     def __init__(self, n_worlds: int, like: Any):
         self.n_worlds = n_worlds
@@ -132,21 +134,15 @@ class Worlds(ABC):
 class BatchedWorlds(Worlds):
     """All worlds in one simulator; picklable with their whole state if the simulator is."""
 
+    shared_owner = True
+
     def __init__(self, sim: BatchedSimulator):
         super().__init__(sim.n_worlds, sim)
         self.sim = sim
 
     @override
     def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[np.ndarray, Infos]:
-        worlds = np.arange(self.n_worlds)
-        if all(option is options[0] for option in options) or not any(options):
-            observations, columns = self.sim.reset(worlds, seeds, options[0] or None)
-            return _flat(observations), _rows(columns, observations.shape[:2])
-        parts = [
-            self.sim.reset(worlds[[w]], [seeds[w]], options[w] or None) for w in range(len(worlds))
-        ]
-        infos = [row for obs, columns in parts for row in _rows(columns, obs.shape[:2])]
-        return _flat(np.concatenate([observations for observations, _ in parts])), infos
+        return begun(reset_all(self.sim, seeds, options))
 
     @override
     def step_async(self, actions: np.ndarray) -> None:
@@ -157,28 +153,11 @@ class BatchedWorlds(Worlds):
         observations, rewards, terminated, truncated, columns = self.sim.step(self._actions)
         shape = (self.n_worlds, len(self.agents))
         assert observations.shape[:2] == rewards.shape == shape, "sim.step returns (W, N, ...)"
-        infos = _rows(columns, shape)
+        step = batched_step(observations, rewards, terminated, truncated, columns)
         ended = np.flatnonzero(terminated | truncated)
-        reset_infos = self._begin(ended, observations, infos) if len(ended) else {}
-        return Step(
-            _flat(observations),
-            np.array(rewards, dtype=np.float32).reshape(-1),
-            np.repeat(terminated, shape[1]),
-            np.repeat(truncated, shape[1]),
-            infos,
-            reset_infos,
-        )
-
-    def _begin(
-        self, ended: np.ndarray, observations: np.ndarray, infos: Infos
-    ) -> dict[int, dict[str, Any]]:
-        """Begin the next episode of some worlds; edits observations and infos in place."""
-        n_agents = len(self.agents)
-        slots = [world * n_agents + agent for world in ended.tolist() for agent in range(n_agents)]
-        for slot, last in zip(slots, _flat(observations[ended]), strict=True):
-            infos[slot]["terminal_observation"] = last
-        observations[ended], columns = self.sim.reset(ended, [None] * len(ended), None)
-        return dict(zip(slots, _rows(columns, (len(ended), n_agents)), strict=True))
+        if len(ended):
+            begin(step, ended, *self.sim.reset(ended, [None] * len(ended), None))
+        return step
 
     @override
     def images(self) -> list[Any]:
@@ -194,13 +173,18 @@ class BatchedWorlds(Worlds):
 
 
 class SuperSuitWorlds(Worlds):
-    """One PettingZoo environment for each world, flattened by SuperSuit in this process."""
+    """One PettingZoo environment for each world, flattened by SuperSuit in this process.
 
-    def __init__(self, envs: list[ParallelEnv]):
+    :param envs: W environments
+    :param new_world: makes a world of an environment and its number
+    """
+
+    def __init__(self, envs: list[ParallelEnv], new_world: NewWorld = World):
         check_distinct(envs)
-        super().__init__(len(envs), World(envs[0], 0))
+        super().__init__(len(envs), new_world(envs[0], 0))
         self.envs = envs
-        self.vec = self._build([partial(_rows_of, env, w) for w, env in enumerate(envs)], 1)
+        makers = [partial(_rows_of, new_world, env, world) for world, env in enumerate(envs)]
+        self.vec = self._build(makers, 1)
 
     def _build(self, makers: Sequence[Callable[[], Any]], n_processes: int) -> Any:
         constructor = MakeCPUAsyncConstructor(n_processes)
@@ -252,16 +236,22 @@ class WorkerWorlds(SuperSuitWorlds):
     :param examples: environments of this process, only looked at
     :param n_worlds: W
     :param n_processes: number of workers
+    :param new_world: makes a world of an environment and its number
     """
 
     def __init__(
-        self, make_env: MakeEnv, examples: list[ParallelEnv], n_worlds: int, n_processes: int
+        self,
+        make_env: MakeEnv,
+        examples: list[ParallelEnv],
+        n_worlds: int,
+        n_processes: int,
+        new_world: NewWorld = World,
     ):
         check_distinct(examples)
-        Worlds.__init__(self, n_worlds, World(examples[0], 0))
+        Worlds.__init__(self, n_worlds, new_world(examples[0], 0))
         for env in examples:
             env.close()
-        makers = [partial(_make_rows, make_env, world) for world in range(n_worlds)]
+        makers = [partial(_make_rows, new_world, make_env, world) for world in range(n_worlds)]
         others = set(multiprocessing.active_children())
         try:
             self.vec = self._build(makers, n_processes)
@@ -347,12 +337,93 @@ class WorkerWorlds(SuperSuitWorlds):
         self.vec.close()
 
 
-def _rows_of(env: ParallelEnv, world: int) -> Any:
-    return ss.pettingzoo_env_to_vec_env_v1(World(env, world))
+def _rows_of(new_world: NewWorld, env: ParallelEnv, world: int) -> Any:
+    return ss.pettingzoo_env_to_vec_env_v1(new_world(env, world))
 
 
-def _make_rows(make_env: MakeEnv, world: int) -> Any:
-    return _rows_of(new_env(make_env), world)
+def _make_rows(new_world: NewWorld, make_env: MakeEnv, world: int) -> Any:
+    return _rows_of(new_world, new_env(make_env), world)
+
+
+def reset_all(sim: Any, seeds: Sequence[int | None], options: Infos) -> list[tuple[Any, Any]]:
+    """Reset all worlds of a simulator, at once unless they get different options.
+
+    :param sim: Its ``reset(worlds, seeds, options)`` is called
+    :param seeds: One for each world
+    :param options: One dict for each world
+    :return: What the calls returned; together they hold all worlds in their order
+    """
+    worlds = np.arange(len(seeds))
+    if all(option is options[0] for option in options) or not any(options):
+        return [sim.reset(worlds, seeds, options[0] or None)]
+    return [sim.reset(worlds[[w]], [seeds[w]], options[w] or None) for w in range(len(worlds))]
+
+
+def begun(parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[np.ndarray, Infos]:
+    """Observations (S, D) and infos of all slots, from a simulator's resets.
+
+    :param parts: See :func:`reset_all`
+    """
+    infos = [row for obs, columns in parts for row in _rows(columns, obs.shape[:2])]
+    return _flat(np.concatenate([observations for observations, _ in parts])), infos
+
+
+def batched_step(
+    observations: np.ndarray,
+    rewards: np.ndarray,
+    terminated: np.ndarray,
+    truncated: np.ndarray,
+    columns: dict[str, np.ndarray],
+) -> Step:
+    """Slots from what a simulator's step returned; no episode has begun yet.
+
+    :param observations: Shape (W, N, D); the step goes on to use this array
+    :param rewards: Shape (W, N)
+    :param terminated: Shape (W,)
+    :param truncated: Shape (W,)
+    :param columns: Arrays (W, N, ...)
+    """
+    n_agents = rewards.shape[1]
+    return Step(
+        _flat(observations),
+        np.array(rewards, dtype=np.float32).reshape(-1),
+        np.repeat(terminated, n_agents),
+        np.repeat(truncated, n_agents),
+        _rows(columns, rewards.shape),
+        {},
+    )
+
+
+def begin(
+    step: Step, ended: np.ndarray, observations: np.ndarray, columns: dict[str, np.ndarray]
+) -> None:
+    """Begin the next episode of some worlds within the step that ended the last one.
+
+    :param step: Of all worlds; edited in place
+    :param ended: Numbers of the R worlds
+    :param observations: First ones of their next episodes, shape (R, N, D)
+    :param columns: Infos of their resets, arrays (R, N, ...)
+    """
+    n_agents = observations.shape[1]
+    slots = (ended[:, None] * n_agents + np.arange(n_agents)).ravel()
+    for slot, last in zip(slots.tolist(), step.observations[slots], strict=True):
+        step.infos[slot]["terminal_observation"] = last
+    step.observations[slots] = _flat(observations)
+    rows = _rows(columns, observations.shape[:2])
+    step.reset_infos.update(zip(slots.tolist(), rows, strict=True))
+
+
+def close_episodes(step: Step) -> np.ndarray:
+    """Tell in the infos whether a time limit ended an episode, as Stable-Baselines3 does.
+
+    :param step: Its infos are edited
+    :return: Whether the episode of each slot has ended, shape (S,)
+    """
+    dones: np.ndarray = step.terminated | step.truncated
+    timeouts = step.truncated & ~step.terminated
+    for slot in np.flatnonzero(dones).tolist():
+        step.infos[slot]["TimeLimit.truncated"] = bool(timeouts[slot])
+    return dones
 
 
 def _flat(array: np.ndarray) -> np.ndarray:
@@ -366,6 +437,9 @@ def _rows(columns: dict[str, np.ndarray], shape: tuple[int, ...]) -> Infos:
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in flat]
     if not lists:
         return [{} for _ in range(int(np.prod(shape)))]
+    if len(lists) == 1:  # several times faster than the general way, and the common case
+        (name,) = columns
+        return [{name: value} for value in lists[0]]
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 

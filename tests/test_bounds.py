@@ -305,6 +305,79 @@ def test_ratios_of_impossible_size_neither_overflow_nor_break_the_sums():
     assert bounds.effective_sample_size(log_ratios) == pytest.approx(0.5)
 
 
+# Gradients at the old policy: what simultaneous updates of all agents improve
+
+
+def tilt(rng, policy, n_agents):
+    """A direction that keeps rows summing to 1: of each agent, or one for all if n_agents is 1."""
+    shape = (len(policy), n_agents, *policy.shape[2:])
+    scores = rng.normal(size=shape)
+    return policy * (scores - (policy * scores).sum(-1, keepdims=True))
+
+
+def slopes(problems, policy, direction, step=1e-4):
+    """Derivatives of J, L, every Lᵢ and Σᵢ Lᵢ along a direction, shape (B, ..., M) each."""
+    ahead, behind = (Update(problems, policy, policy + t * direction) for t in (step, -step))
+
+    def numbers(update):
+        surrogates = (bounds.joint_surrogate, bounds.agent_surrogates, bounds.sum_surrogate)
+        return [update.new_cost, *(update.every(surrogate) for surrogate in surrogates)]
+
+    pairs = zip(numbers(ahead), numbers(behind), strict=True)
+    return [(a - b) / (2 * step) for a, b in pairs]
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 0.9])
+def test_the_joint_surrogate_and_the_sum_have_the_gradient_of_the_cost(gamma):
+    rng = np.random.default_rng(14)
+    problems = tabular.random_problems(rng, 10, 4, n_agents=3, n_actions=2, gamma=gamma)
+    policy = tabular.random_policy(rng, 10, 3, 4, 2)
+    cost, joint, agents, together = slopes(problems, policy, tilt(rng, policy, 3))
+    np.testing.assert_allclose(joint, cost, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(together, cost, rtol=0, atol=1e-6)
+    assert np.abs(agents - cost[:, None]).max() > 0.01
+
+
+def test_the_surrogate_of_an_agent_has_the_gradient_of_the_cost_if_it_moves_alone():
+    rng = np.random.default_rng(15)
+    problems = tabular.random_problems(rng, 10, 4, n_agents=3, n_actions=2, gamma=0.9)
+    policy = tabular.random_policy(rng, 10, 3, 4, 2)
+    direction = tilt(rng, policy, 3)
+    direction[:, 1:] = 0
+    cost, _, agents, _ = slopes(problems, policy, direction)
+    np.testing.assert_allclose(agents[:, 0], cost, rtol=0, atol=1e-6)
+
+
+def test_with_shared_weights_the_sum_has_the_gradient_of_the_cost_and_one_agent_has_not():
+    rng = np.random.default_rng(16)
+    problems = tabular.random_problems(rng, 10, 4, n_agents=3, n_actions=2, gamma=0.9)
+    policy = np.repeat(tabular.random_policy(rng, 10, 1, 4, 2), 3, axis=1)
+    cost, _, agents, together = slopes(problems, policy, tilt(rng, policy, 1))
+    np.testing.assert_allclose(together, cost, rtol=0, atol=1e-6)
+    assert np.abs(agents[:, 0] - cost).max() > 0.1
+
+
+def test_the_mean_of_the_rows_that_ppo_improves_is_the_sum_of_the_surrogates():
+    # E_d[qᵢ A], averaged over the agents as minibatches of rows do: (1 − γ)/N Σᵢ Lᵢ
+    for update in random_updates(17, count=2, steps=(0.1,)):
+        n_agents, gamma = update.policy.shape[1], update.problems.gamma
+        for log_ratios, advantages, weights in update.rollouts():
+            rows = np.exp(log_ratios)[..., None] * advantages[..., None, :]
+            found = bounds.visit_mean(rows.mean(-2), weights)
+            together = bounds.sum_surrogate(log_ratios, advantages, weights)
+            np.testing.assert_allclose(found, (1 - gamma) / n_agents * together, **EXACT)
+
+
+def test_a_penalty_that_is_the_same_for_all_actions_has_no_gradient():
+    # the bracket λ (J − l) of Eq. 8 (docs/paper.md, D2), or a critic's error in a state
+    for update in random_updates(18, count=2, steps=(0.1,)):
+        for log_ratios, advantages, weights in update.rollouts():
+            error = 7 * np.sin(np.arange(len(weights)))[:, None, None]
+            constant = np.broadcast_to(error, advantages.shape)
+            for surrogate in (bounds.joint_surrogate, bounds.agent_surrogates):
+                np.testing.assert_allclose(surrogate(log_ratios, constant, weights), 0, **EXACT)
+
+
 # Divergences
 
 

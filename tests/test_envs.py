@@ -47,23 +47,23 @@ def stay(sim):
 # ---- every registered environment
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", ROVER_IDS)
 def test_the_parallel_api_test_passes(env_id):
     parallel_api_test(ENV_IDS[env_id](), num_cycles=200)
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", ROVER_IDS)
 def test_the_same_seed_gives_the_same_episode(env_id):
     parallel_seed_test(ENV_IDS[env_id], num_cycles=100)
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", ROVER_IDS)
 def test_pettingzoo_makes_it_by_id_without_wrappers(env_id):
     env = pettingzoo.make("parallel", env_id)
     assert type(env) is type(ENV_IDS[env_id]())
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", ROVER_IDS)
 def test_observations_lie_in_their_space_and_costs_are_reported(env_id):
     env = ENV_IDS[env_id]()
     observations, _ = env.reset(seed=3)
@@ -75,7 +75,7 @@ def test_observations_lie_in_their_space_and_costs_are_reported(env_id):
         assert all("cost" in info for info in infos.values())
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", ROVER_IDS)
 def test_a_pickle_taken_during_an_episode_continues_identically(env_id):
     env = ENV_IDS[env_id]()
     env.reset(seed=5)

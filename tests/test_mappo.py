@@ -619,3 +619,12 @@ class TestErrors:
         env = ss.concat_vec_envs_v1(rows, 2, base_class="stable_baselines3")
         with pytest.raises(TypeError, match=r"use sb3_e2c.share_parameters"):
             make(env=env)
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "GruPolicy"])
+def test_actor_and_critics_may_have_features_extractors_of_their_own(policy):
+    env = share_parameters(TwoOnALine, n_worlds=2)
+    kwargs = {"share_features_extractor": False}
+    model = MAPPO(policy, env, n_steps=8, batch_size=16, n_epochs=1, policy_kwargs=kwargs)
+    model.learn(32)
+    assert model.num_timesteps == 32

@@ -12,7 +12,11 @@ SMALL = ["--rounds", "1", "--threads", "1", "--worlds", "1", "--epochs", "1", "-
 
 @pytest.mark.parametrize(
     ("env", "policy", "peer"),
-    [("rover", "mlp", "SB3 PPO"), ("simple_spread", "gru", "sb3-contrib RecurrentPPO")],
+    [
+        ("rover", "mlp", "SB3 PPO"),
+        ("simple_spread", "gru", "sb3-contrib RecurrentPPO"),
+        ("predator_prey", "mlp", "SB3 PPO"),
+    ],
 )
 def test_it_compares_with_a_peer_and_says_where_the_time_goes(tmp_path, capsys, env, policy, peer):
     file = tmp_path / "out.json"

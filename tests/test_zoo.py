@@ -28,9 +28,9 @@ from sb3_e2c.zoo import cli, configuration, demo, enjoy, train
 from sb3_e2c.zoo.build import make_worlds
 from sb3_e2c.zoo.configuration import FOLDER, merge, read_yaml, resolve
 from sb3_e2c.zoo.console import UserError, check_device, check_writable, parse_value, write_whole
+from sb3_e2c.zoo.curves import plot_learning
 from sb3_e2c.zoo.normalization import load_statistics, save_statistics
 from sb3_e2c.zoo.parts import CLASSES, classes_in
-from sb3_e2c.zoo.plots import plot_learning
 from sb3_e2c.zoo.runs import make_env, open_run
 from sb3_e2c.zoo.signatures import arguments_of
 
@@ -143,7 +143,7 @@ def test_the_five_methods_are_settings_of_one_algorithm():
 @pytest.mark.parametrize("algo", configuration.ALGORITHMS)
 def test_every_task_has_hyperparameters_for_every_method(env_id, algo):
     config = resolve(algo, env_id)
-    n_agents = len(ENV_IDS[env_id](**config["env_kwargs"]).possible_agents)
+    n_agents = len(ENV_IDS[env_id](**config.get("env_kwargs", {})).possible_agents)
     assert config["n_envs"] * config["n_steps"] * n_agents >= 4096
 
 
@@ -821,12 +821,12 @@ def test_the_plot_is_a_picture_in_the_run_folder(copy):
 
 
 def test_plotting_into_a_folder_is_one_line(trained, tmp_path, capsys):
-    argv = ["plots", run_folder(trained), "-o", tmp_path]
+    argv = ["plot", run_folder(trained), "-o", tmp_path]
     assert f"--out {tmp_path} is a folder" in refusal(capsys, cli.main, argv)
 
 
 def test_plotting_something_else_is_one_line(tmp_path, capsys):
-    assert "not the folder of one run" in refusal(capsys, cli.main, ["plots", tmp_path])
+    assert "not the folder of one run" in refusal(capsys, cli.main, ["plot", tmp_path])
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
-from sb3_e2c.vec_env import MultiAgentVecEnv
+from sb3_e2c.vec_env import MultiAgentVecEnv, OpponentVecEnv
 from sb3_e2c.zoo.configuration import ALGORITHMS, ZOO_KEYS
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.parts import CLASSES, class_named
@@ -147,6 +147,20 @@ def load_weights(model: MAPPO, path: str | Path) -> None:
             f"{path} does not fit; was it trained with another algorithm or environment? "
             f"{brief(error)}"
         ) from error
+
+
+def load_opponent(model: MAPPO, env: OpponentVecEnv, path: str | Path) -> MAPPO:
+    """An adversary with the networks that the team's settings give it, and weights from a file.
+
+    :param model: The team
+    :param env: Where both act
+    :param path: What was saved beside a team
+    :raises UserError: if the file is broken, or belongs to another kind of model
+    """
+    opponent = model.new_opponent(env)
+    load_weights(opponent, path)
+    check_finite(opponent, path)
+    return opponent
 
 
 def check_finite(model: MAPPO, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Console command ``sb3-e2c train|enjoy|demo|plot``."""
+"""Console command ``sb3-e2c train|enjoy|...``; see ``COMMANDS``."""
 
 import importlib
 import sys
@@ -9,8 +9,11 @@ from sb3_e2c.zoo.console import fail, unknown
 COMMANDS = {
     "train": "train a team",
     "enjoy": "evaluate a trained team",
+    "record": "film a trained team, or what it learned",
+    "export": "write the actor as an ONNX file, to act without torch",
     "demo": "train, evaluate and film one team in a few minutes",
-    "plots": "draw the learning curves of a run",
+    "benchmark": "run the experiments of a suite, on one machine or many",
+    "plot": "draw the curves of a run, or the figures of a benchmark",
     "speed": "train beside other libraries and compare the speed",
 }
 

@@ -17,9 +17,10 @@ from sb3_e2c import evaluate_team
 from sb3_e2c.zoo import train
 from sb3_e2c.zoo.build import build_model
 from sb3_e2c.zoo.console import ConsoleParser, one_line_errors
+from sb3_e2c.zoo.curves import plot_learning
 from sb3_e2c.zoo.enjoy import summarize
-from sb3_e2c.zoo.plots import plot_learning
-from sb3_e2c.zoo.runs import Run, load_model, make_env, open_run, record_episode
+from sb3_e2c.zoo.record import record_episode
+from sb3_e2c.zoo.runs import Run, load_model, make_env, open_run
 
 ALGO, ENV_ID = "e2c_t", "MultiRover-6-3-v0"
 EPISODES = WORLDS = 100

@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
 from sb3_e2c import MAPPO, evaluate_team
 from sb3_e2c.evaluation import TeamEvaluation
-from sb3_e2c.zoo.configuration import ALGORITHMS, team_limits
+from sb3_e2c.vec_env import opponent_env
+from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import (
     ConsoleParser,
     StoreDict,
@@ -28,21 +30,23 @@ from sb3_e2c.zoo.console import (
     one_line_errors,
     write_whole,
 )
-from sb3_e2c.zoo.runs import Run, find_run, load_model, make_env, record_episode
+from sb3_e2c.zoo.record import check_video, record_episode
+from sb3_e2c.zoo.runs import (
+    Run,
+    add_run_flags,
+    check_seed,
+    choose_opponent,
+    find_run,
+    load_model,
+    make_env,
+)
 
 
 def make_parser() -> ConsoleParser:
     """The flags of ``enjoy``: RL-Zoo's names, and ``--n-episodes --json --video --trust``."""
     parser = ConsoleParser(prog="sb3-e2c enjoy", description=(__doc__ or "").split("\n\n")[1])
     add, switch = parser.add_argument, "store_true"
-    add("--algo", default="e2c_t", help=f"{', '.join(ALGORITHMS)} (default: e2c_t)")
-    add("--env", default="MultiRover-6-3-v0", help="environment ID")
-    add("-f", "--folder", default="logs", help="log folder (default: logs)")
-    add("--exp-id", type=int, default=0, help="number of the run (default: the latest)")
-    which = parser.add_mutually_exclusive_group().add_argument
-    which("--load-best", action=switch, help="load the best model instead of the last")
-    which("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
-    which("--load-last-checkpoint", action=switch, help="load the last checkpoint")
+    add_run_flags(parser)
     add("--n-episodes", type=int, default=100, help="episodes of the team (default: 100)")
     add("--n-envs", type=int, default=10, help="worlds at a time (default: 10)")
     how = parser.add_mutually_exclusive_group().add_argument
@@ -51,6 +55,19 @@ def make_parser() -> ConsoleParser:
         "--stochastic",
         action=switch,
         help="sample actions (the default: the limits were trained for the sampled policy)",
+    )
+    add(
+        "--opponent",
+        nargs="+",
+        default=["own"],
+        metavar="own|random|FILE",
+        help="who plays against the team, where somebody does: the adversary that was trained "
+        "beside it (default), random actions, or saved adversaries; several are reported in turn",
+    )
+    add(
+        "--deterministic-opponent",
+        action=switch,
+        help="the adversary takes its most likely actions (default: it samples)",
     )
     add("--seed", type=int, default=0, help="of worlds and sampled actions (default: 0)")
     add("--env-kwargs", nargs="+", action=StoreDict, metavar="KEY:VALUE", help="changed arguments")
@@ -79,13 +96,10 @@ def _check(args: argparse.Namespace) -> None:
         if getattr(args, name) < 1:
             flag = f"--{name.replace('_', '-')}"
             raise UserError(f"{flag} is {getattr(args, name)}; expected at least 1")
-    if not 0 <= args.seed < 2**32:
-        raise UserError(f"--seed is {args.seed}; expected a number from 0 to 2**32 - 1")
+    check_seed(args.seed)
     check_device(args.device)
-    for flag, path in (("--json", args.json), ("--video", args.video)):
-        check_file(path, flag)
-    if args.video is not None and args.video.suffix not in (".gif", ".mp4"):
-        raise UserError(f"--video is {args.video}; expected a name that ends in .gif or .mp4")
+    check_file(args.json, "--json")
+    check_video(args.video, "--video")
 
 
 def summarize(run: Run, model: MAPPO, result: TeamEvaluation, **settings: Any) -> dict[str, Any]:
@@ -139,14 +153,45 @@ def _plain(numbers: Any) -> Any:
 def report(summary: dict[str, Any]) -> str:
     """The summary for a person.
 
-    :param summary: See :func:`summarize`
+    :param summary: See :func:`enjoy`
     """
+    against = summary.get("against", [])
+    if len(against) > 1:
+        return "\n".join([_heading(summary), _table(against)])
+    lines = [_heading(summary)]
+    if against:
+        lines.append(f"opponent   {summary['opponent']}")
+    return "\n".join([*lines, *_results(summary)])
+
+
+def _heading(summary: dict[str, Any]) -> str:
     actions = "most likely actions" if summary["deterministic"] else "sampled actions"
-    lines = [
-        str(summary["model"]),
-        f"{summary['episodes']} episodes of the team, {actions}, seed {summary['seed']}",
-        f"return     {_mean(summary['team_return'], summary['team_return_se'])}",
-    ]
+    episodes = f"{summary['episodes']} episodes of the team, {actions}, seed {summary['seed']}"
+    return f"{summary['model']}\n{episodes}"
+
+
+def _table(summaries: list[dict[str, Any]]) -> str:
+    """One line for each opponent."""
+    rows = [("opponent", "return", "cost", "violation")]
+    for each in summaries:
+        cost, rate = each["team_cost"], each["violation_rate"]
+        rows.append(
+            (
+                str(each["opponent"]),
+                _mean(each["team_return"], each["team_return_se"]),
+                "-" if cost is None else _mean(cost, each["team_cost_se"]),
+                "-" if rate is None else f"{rate:.1%}",
+            )
+        )
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )
+
+
+def _results(summary: dict[str, Any]) -> list[str]:
+    lines = [f"return     {_mean(summary['team_return'], summary['team_return_se'])}"]
     if summary["team_cost"] is not None:
         limits = ", ".join(f"{limit:g}" for limit in summary["cost_limits"])
         imposed = "limit" if summary["constrained"] else "not constrained; the task's limit"
@@ -159,7 +204,7 @@ def report(summary: dict[str, Any]) -> str:
     if summary["lambda"] is not None:
         numbers = ", ".join(f"{number:.3f}" for number in np.atleast_1d(summary["lambda"]))
         lines.append(f"lambda     {numbers}")
-    return "\n".join(lines)
+    return lines
 
 
 def _mean(mean: Any, error: Any) -> str:
@@ -171,27 +216,44 @@ def enjoy(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate, and film if asked.
 
     :param args: See :func:`make_parser`
-    :return: See :func:`summarize`
+    :return: See :func:`summarize`; with opponents also ``opponent``, and what came of each one that
+        was asked for in the list ``against``
     """
     _check(args)
     run = find_run(args)
-    set_random_seed(args.seed)
-    settings = {"deterministic": args.deterministic, "seed": args.seed}
     with closing(make_env(run, args.n_envs, args.seed, args.env_kwargs, args.trust)) as env:
-        model = load_model(run, env, args.seed, args.device, args.trust)
-        with closing(tqdm(total=args.n_episodes, disable=not args.progress)) as bar:
-            result = evaluate_team(
-                model,
-                env,
-                args.n_episodes,
-                settings["deterministic"],
-                callback=lambda locals_, _: bar.update(int(locals_["done"])),
-            )
+        model = load_model(run, env, args.seed, args.device, args.trust, args.opponent[0])
+        has_opponents = opponent_env(env) is not None
+        summaries = []
+        for opponent in args.opponent:
+            choose_opponent(run, model, env, opponent, args.deterministic_opponent)
+            result = _evaluate(model, env, args)
+            who = {"opponent": opponent} if has_opponents else {}
+            settings = {"deterministic": args.deterministic, "seed": args.seed, **who}
+            summaries.append(summarize(run, model, result, **settings))
     if args.video is not None:
-        kwargs = {**(args.env_kwargs or {}), "render_mode": "rgb_array"}
-        with closing(make_env(run, 1, args.seed, kwargs, args.trust)) as env:
-            record_episode(model, env, args.video, settings["deterministic"])
-    return summarize(run, model, result, **settings)
+        _film(run, model, args)
+    return {**summaries[0], "against": summaries} if has_opponents else summaries[0]
+
+
+def _evaluate(model: MAPPO, env: VecEnv, args: argparse.Namespace) -> TeamEvaluation:
+    set_random_seed(args.seed)
+    env.seed(args.seed)
+    with closing(tqdm(total=args.n_episodes, disable=not args.progress)) as bar:
+        return evaluate_team(
+            model,
+            env,
+            args.n_episodes,
+            args.deterministic,
+            callback=lambda locals_, _: bar.update(int(locals_["done"])),
+        )
+
+
+def _film(run: Run, model: MAPPO, args: argparse.Namespace) -> None:
+    kwargs = {**(args.env_kwargs or {}), "render_mode": "rgb_array"}
+    with closing(make_env(run, 1, args.seed, kwargs, args.trust)) as env:
+        choose_opponent(run, model, env, args.opponent[0], args.deterministic_opponent)
+        record_episode(model, env, args.video, args.deterministic)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shlex
+import signal
 import warnings
 from argparse import Namespace
 from copy import deepcopy
@@ -20,7 +21,7 @@ from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     ProgressBarCallback,
 )
-from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -28,16 +29,19 @@ from sb3_e2c import MAPPO, TeamEvalCallback
 from sb3_e2c.constraints import check_n_costs, read_costs
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.monitor import TeamMonitor
+from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.build import (
     build_model,
     check_finite,
     constructor_arguments,
+    load_opponent,
     make_worlds,
     refusals_of,
 )
 from sb3_e2c.zoo.configuration import (
     ALGORITHMS,
     ZOO_KEYS,
+    check,
     merge,
     parse_presets,
     read_yaml,
@@ -45,6 +49,7 @@ from sb3_e2c.zoo.configuration import (
 )
 from sb3_e2c.zoo.console import UserError, brief, write_whole
 from sb3_e2c.zoo.normalization import load_statistics, save_statistics, statistics_path
+from sb3_e2c.zoo.resume import KeepPoints, Resumable, ignore_stop_signals, tensorboard_format
 
 # What a continued run may change: numbers that a loaded model reads anew in each rollout.
 _CHANGEABLE = (
@@ -72,6 +77,10 @@ def configure(args: Namespace) -> dict[str, Any]:
     :param args: Parsed flags of ``train``
     :raises UserError: for anything in it that cannot be meant
     """
+    if args.resume:
+        config = read_yaml(Path(args.resume) / args.env / "config.yml")
+        check(args.algo, config)
+        return config
     overrides = merge(
         _conf_file(args), {"env_kwargs": args.env_kwargs or {}}, args.hyperparams or {}
     )
@@ -137,6 +146,12 @@ class TeamExperimentManager(ExperimentManager):
         self.deterministic_eval = False  # limits hold for the policy that is trained: the sampled
         self.env_id = self.args.env
         self.n_slots = 0
+        if self.args.resume:
+            self.save_path = str(Path(self.args.resume))
+            self.params_path = os.path.join(self.save_path, self.env_id)
+        run = Path(self.save_path)
+        self.points = Resumable(run, self.args.resume_every, bool(self.args.resume))
+        self.stopped_by: int | None = None  # number of the signal
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]]:
         """Build everything; nothing is written before all of it has been built once.
@@ -144,6 +159,9 @@ class TeamExperimentManager(ExperimentManager):
         :return: The model, and the configuration of the run
         """
         config = configure(self.args)
+        if self.args.resume:
+            self.points.open(config, self.n_timesteps)
+            self.n_timesteps = self.points.total
         self.n_envs = config["n_envs"]
         self.n_timesteps = self.n_timesteps if self.n_timesteps > 0 else config["n_timesteps"]
         self.env_kwargs = config.get("env_kwargs") or {}
@@ -153,9 +171,14 @@ class TeamExperimentManager(ExperimentManager):
         if self.verbose > 0:
             self._describe(config)
         self.create_log_folder()
+        if self.args.resume:
+            self.points.cut_logs()
+        else:
+            self.points.open(config)
         self.create_callbacks()
         model = self._make_model(config, self.create_envs(self.n_envs), self.verbose)
-        self._save_config(config)
+        if not self.args.resume:
+            self._save_config(config)
         return model, config
 
     def _own_callbacks(self, config: dict[str, Any]) -> list[BaseCallback]:
@@ -188,6 +211,18 @@ class TeamExperimentManager(ExperimentManager):
 
     def _make_model(self, config: dict[str, Any], env: VecEnv, verbose: int) -> MAPPO:
         flags: dict[str, Any] = {"seed": self.seed, "device": self.device, "verbose": verbose}
+        against = opponent_env(env)
+        own = self.args.opponent == "own"
+        if against is not None and not own:
+            against.set_opponent("random")
+        elif not own:
+            raise UserError(f"--opponent: nobody plays against a team in {self.env_id}")
+        model = self._new_or_continued(config, env, flags)
+        if against is not None and self.args.opponent not in ("own", "random"):
+            against.set_opponent(load_opponent(model, against, self.args.opponent))
+        return model
+
+    def _new_or_continued(self, config: dict[str, Any], env: VecEnv, flags: Any) -> MAPPO:
         if not self.continue_training:
             return build_model(self.algo, config, env, **flags)
         changes = constructor_arguments({k: config[k] for k in _CHANGEABLE if k in config})
@@ -217,11 +252,12 @@ class TeamExperimentManager(ExperimentManager):
             if eval_env
             else self.env_kwargs,
             n_envs,
-            seed=self.seed + self.n_envs if eval_env else self.seed,
+            seed=self.points.world_seed(self.seed) + (self.n_envs if eval_env else 0),
             n_processes=min(n_envs, os.cpu_count() or 1) if parallel else 1,
         )
         log = None if eval_env or no_log else os.path.join(self.save_path, "monitor.csv")
-        return self._maybe_normalize(TeamMonitor(env, log), eval_env)
+        monitored = TeamMonitor(env, log, override_existing=not self.args.resume)
+        return self._maybe_normalize(monitored, eval_env)
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         """Add ``normalize:``; a continued run goes on with its statistics."""
@@ -258,6 +294,7 @@ class TeamExperimentManager(ExperimentManager):
                     verbose=self.verbose,
                 )
             )
+        self.callbacks.append(KeepPoints(self.points))
 
     def _calls(self, agent_steps: int) -> int:
         """How many calls of ``env.step`` make so many agent steps."""
@@ -271,6 +308,9 @@ class TeamExperimentManager(ExperimentManager):
         """
         model.set_logger(self._logger())
         log_interval = {-1: 1, -2: None}.get(self.log_interval, self.log_interval)
+        assert model.env is not None
+        evaluations = [each for each in self.callbacks if isinstance(each, TeamEvalCallback)]
+        self.points.check_worlds(model.env, *(each.eval_env for each in evaluations))
         try:
             model.learn(
                 self.n_timesteps,
@@ -278,13 +318,17 @@ class TeamExperimentManager(ExperimentManager):
                 log_interval=log_interval,  # type: ignore[arg-type]
                 reset_num_timesteps=not self.continue_training,
             )
-        except KeyboardInterrupt:
-            print("Interrupted: saving what has been learned")
+        except KeyboardInterrupt as stop:
+            ignore_stop_signals()
+            self.stopped_by = getattr(stop, "number", signal.SIGINT)
+            print(f"Interrupted at {model.num_timesteps:,} agent steps: saving")
         except (ValueError, RuntimeError, MemoryError) as error:
+            self.points.write()
             raise UserError(
                 f"training stopped: {brief(error)}; {self.save_path} keeps what was saved before"
             ) from error
         finally:
+            ignore_stop_signals()
             self._release(model)
 
     def _release(self, model: BaseAlgorithm) -> None:
@@ -302,13 +346,15 @@ class TeamExperimentManager(ExperimentManager):
 
     def _logger(self) -> Logger:
         """progress.csv in the run folder; tables with ``--verbose 1``; TensorBoard with ``-tb``."""
-        formats = [make_output_format("csv", self.save_path)]
+        formats: list[KVWriter] = [self.points.progress_file()]
         if self.verbose > 0:
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
-            run = get_latest_run_id(self.tensorboard_log, self.algo) + 1
-            folder = os.path.join(self.tensorboard_log, f"{self.algo}_{run}")
-            formats.append(make_output_format("tensorboard", folder))
+            if self.points.tensorboard is None:
+                run = get_latest_run_id(self.tensorboard_log, self.algo) + 1
+                folder = os.path.join(self.tensorboard_log, f"{self.algo}_{run}")
+                self.points.tensorboard = os.path.abspath(folder)
+            formats.append(tensorboard_format(self.points.tensorboard, self.points.steps))
         return Logger(self.save_path, formats)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
@@ -324,6 +370,7 @@ class TeamExperimentManager(ExperimentManager):
         if normalizer is not None:
             normalizer.save(os.path.join(self.params_path, "vecnormalize.pkl"))
             save_statistics(normalizer, statistics_path(path))
+        self.points.write()  # not before, so that a run whose last point is there has its model
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         """Write config.yml, args.yml and command.txt as plain data."""

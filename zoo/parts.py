@@ -62,6 +62,12 @@ _TEAM = {
     **dict.fromkeys(("use_sde", "full_std", "use_expln", "squash_output"), "MAPPO without gSDE"),
 }
 
+_OPPONENTS = {
+    name: "the team's"
+    for name in inspect.signature(MAPPO).parameters
+    if name not in MAPPO.opponent_arguments - {"policy", "policy_kwargs", "device"}
+}
+
 PARTS: dict[str, Part] = {
     "policy_kwargs": Part("policy", {**_SPACES, **_TEAM}),
     "optimizer_kwargs": Part(
@@ -69,6 +75,7 @@ PARTS: dict[str, Part] = {
     ),
     "features_extractor_kwargs": Part("features_extractor_class", _SPACES),
     "multipliers_kwargs": Part("multipliers_class", {"shape": "cost_limits and cost_scope"}),
+    "opponent_kwargs": Part(MAPPO, _OPPONENTS),
     "oem_kwargs": Part(OEMRewardCallback),
     "estimator_kwargs": Part("estimator"),
     "normalize": Part(VecNormalize, {"venv": "the environment", "gamma": "gamma"}),

@@ -1,22 +1,28 @@
-"""Find a run of ``train`` and bring its model back, for ``enjoy``, the demo and plots."""
+"""Find a run of ``train`` and bring its model back, for every command that uses one."""
 
 import contextlib
 import io
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import imageio
-import numpy as np
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_model_path
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import MAPPO
-from sb3_e2c.zoo.build import build_model, check_finite, load_weights, make_worlds
+from sb3_e2c.opponents import adversary_path
+from sb3_e2c.vec_env import opponent_env
+from sb3_e2c.zoo.build import (
+    build_model,
+    check_finite,
+    load_opponent,
+    load_weights,
+    make_worlds,
+)
 from sb3_e2c.zoo.configuration import ALGORITHMS, check, check_algo, check_env, merge, read_yaml
-from sb3_e2c.zoo.console import UserError, brief, write_whole
+from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.normalization import load_statistics, statistics_path
 
 
@@ -38,10 +44,35 @@ class Run:
     config: dict[str, Any]
 
 
-def find_run(args: Namespace) -> Run:
-    """The run that the flags of ``enjoy`` name.
+def add_run_flags(parser: ArgumentParser) -> None:
+    """RL-Zoo's flags that say which model of which run: what :func:`find_run` reads.
 
-    :param args: ``algo, env, folder, exp_id, load_best, load_checkpoint, load_last_checkpoint``
+    :param parser: Gets the flags
+    """
+    add, switch = parser.add_argument, "store_true"
+    add("--algo", default="e2c_t", help=f"{', '.join(ALGORITHMS)} (default: e2c_t)")
+    add("--env", default="MultiRover-6-3-v0", help="environment ID")
+    add("-f", "--folder", default="logs", help="log folder (default: logs)")
+    add("--exp-id", type=int, default=0, help="number of the run (default: the latest)")
+    which = parser.add_mutually_exclusive_group().add_argument
+    which("--load-best", action=switch, help="load the best model instead of the last")
+    which("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
+    which("--load-last-checkpoint", action=switch, help="load the last checkpoint")
+
+
+def check_seed(seed: int) -> None:
+    """Raise :class:`UserError` for a number that numpy does not take as a seed.
+
+    :param seed: What ``--seed`` says
+    """
+    if not 0 <= seed < 2**32:
+        raise UserError(f"--seed is {seed}; expected a number from 0 to 2**32 - 1")
+
+
+def find_run(args: Namespace) -> Run:
+    """The run that the flags of :func:`add_run_flags` name.
+
+    :param args: The parsed flags
     :raises UserError: if there is no such run or model, or it belongs to something else
     """
     check_algo(args.algo)
@@ -106,7 +137,12 @@ def make_env(
 
 
 def load_model(
-    run: Run, env: VecEnv, seed: int | None = None, device: str = "auto", trust: bool = False
+    run: Run,
+    env: VecEnv,
+    seed: int | None = None,
+    device: str = "auto",
+    trust: bool = False,
+    opponent: str = "own",
 ) -> MAPPO:
     """The run's model, rebuilt from config.yml; from the zip it takes weights only.
 
@@ -115,14 +151,54 @@ def load_model(
     :param seed: For sampled actions
     :param device: Where its networks shall be
     :param trust: Unpickle the zip instead, which can execute what its author put there
+    :param opponent: See :func:`choose_opponent`
     """
+    against = opponent_env(env)
+    if against is not None:
+        against.set_opponent("random")  # for now, so that the model brings none of its own
     if not trust:
         model = build_model(run.algo, run.config, env, seed=seed, device=device)
         load_weights(model, run.model_path)
     else:
         model = _unpickle(run, env, seed=seed, device=device)
     check_finite(model, run.model_path)
+    choose_opponent(run, model, env, opponent)
     return model
+
+
+def choose_opponent(
+    run: Run, model: MAPPO, env: VecEnv, opponent: str, deterministic: bool = False
+) -> None:
+    """Let somebody act for the opponents in an environment, if there are any.
+
+    :param run: The run
+    :param model: Its model
+    :param env: The environment
+    :param opponent: "own": the adversary that was saved beside the model; "random"; or the zip
+        file of another adversary
+    :param deterministic: Whether the adversary takes the most likely actions
+    :raises UserError: if there is no such adversary, or it does not fit
+    """
+    against = opponent_env(env)
+    if against is None:
+        if opponent != "own":
+            raise UserError(f"--opponent {opponent}: nobody plays against a team in {run.env_id}")
+    elif opponent == "random":
+        against.set_opponent("random")
+    else:
+        adversary = load_opponent(model, against, _adversary_file(run, opponent))
+        against.set_opponent(adversary, deterministic=deterministic)
+
+
+def _adversary_file(run: Run, opponent: str) -> Path:
+    path = adversary_path(run.model_path) if opponent == "own" else Path(opponent)
+    if not path.is_file():
+        why = "the team's own adversary" if opponent == "own" else "--opponent"
+        raise UserError(
+            f"{path} ({why}) does not exist, and without an adversary the task is another one; "
+            "name a file like PredatorPrey-v0.adversary.zip, or say --opponent random"
+        )
+    return path
 
 
 def _unpickle(run: Run, env: VecEnv, **flags: Any) -> MAPPO:
@@ -130,33 +206,3 @@ def _unpickle(run: Run, env: VecEnv, **flags: Any) -> MAPPO:
         return ALGORITHMS[run.algo].load(run.model_path, env=env, **flags)
     except Exception as error:  # whatever a broken or foreign pickle may raise
         raise UserError(f"cannot load {run.model_path}: {brief(error)}") from error
-
-
-def record_episode(model: MAPPO, env: VecEnv, path: Path, deterministic: bool) -> None:
-    """Film one episode of the first world.
-
-    :param model: The team
-    :param env: Worlds with ``render_mode="rgb_array"``
-    :param path: A name that ends in .gif or .mp4
-    :param deterministic: Whether it takes the most likely actions
-    """
-    observations: Any = env.reset()
-    state = None
-    starts = np.ones(env.num_envs, dtype=bool)
-    frames = [env.get_images()[0]]
-    while True:
-        actions, state = model.predict(observations, state, starts, deterministic)
-        observations, _, starts, _ = env.step(actions)
-        if starts[0]:  # the worlds show their next episode already
-            break
-        frames.append(env.get_images()[0])
-    if any(frame is None for frame in frames):
-        raise UserError("this environment cannot be filmed: it has no rgb_array rendering")
-    _write_video(frames, path, fps=env.get_attr("metadata")[0].get("render_fps", 10))
-
-
-def _write_video(frames: list[Any], path: Path, fps: float) -> None:
-    # By default imageio stretches films to multiples of 16 pixels.
-    film = {"fps": fps, "macro_block_size": 2}
-    options: Any = {"duration": 1000 / fps, "loop": 0} if path.suffix == ".gif" else film
-    write_whole(path, imageio.mimwrite("<bytes>", frames, format=path.suffix, **options))

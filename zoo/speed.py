@@ -20,6 +20,7 @@ import numpy as np
 import supersuit as ss
 import torch as th
 from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -28,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
+from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.console import ConsoleParser, UserError, one_line_errors, unknown, write_whole
 
 WIDTH = 128
@@ -38,8 +40,41 @@ class Task:
     """What all contenders train on."""
 
     make_env: Callable[[], ParallelEnv]
-    episode: int  # steps
     rollout: int  # steps of each world
+    peers_env: Callable[[], ParallelEnv] | None = None  # the team alone; None: as make_env
+
+
+class RandomOpponents(BaseParallelWrapper):
+    """Hides the opponents from peers, who know no such thing; their actions are random."""
+
+    def __init__(self, env: ParallelEnv):
+        super().__init__(env)
+        self.possible_agents = list(env.metadata["team"])
+        self.opponents = list(env.metadata["opponents"])
+        self.render_mode = None
+
+    @property
+    def agents(self) -> list[str]:
+        """The team."""
+        return self.possible_agents if self.env.agents else []
+
+    @agents.setter
+    def agents(self, _: list[str]) -> None:
+        pass
+
+    @property
+    def unwrapped(self) -> ParallelEnv:
+        """Not the wrapped environment: SuperSuit reads the agents there."""
+        return self
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """Step with a random action of every opponent."""
+        others = {agent: self.env.action_space(agent).sample() for agent in self.opponents}
+        answers = self.env.step({**actions, **others})
+        observations, rewards, terminated, truncated, infos = (
+            {agent: answer[agent] for agent in self.possible_agents} for answer in answers
+        )
+        return observations, rewards, terminated, truncated, infos
 
 
 def _simple_spread() -> ParallelEnv:
@@ -56,9 +91,14 @@ def _rover() -> ParallelEnv:
     return ENV_IDS["MultiRover-6-2-v0"](reward_at="capture")
 
 
+def _hunt() -> ParallelEnv:
+    return ENV_IDS["PredatorPrey-v0"](max_cycles=25)
+
+
 TASKS = {
-    "simple_spread": Task(_simple_spread, episode=25, rollout=200),
-    "rover": Task(_rover, episode=80, rollout=80),
+    "simple_spread": Task(_simple_spread, rollout=200),
+    "rover": Task(_rover, rollout=80),
+    "predator_prey": Task(_hunt, rollout=200, peers_env=lambda: RandomOpponents(_hunt())),
 }
 
 
@@ -138,7 +178,7 @@ class Contender:
 
 def _supersuit(task: Task, n_worlds: int) -> VecEnv:
     """Slots as SuperSuit alone makes them, for the peers."""
-    rows = ss.pettingzoo_env_to_vec_env_v1(task.make_env())
+    rows = ss.pettingzoo_env_to_vec_env_v1((task.peers_env or task.make_env)())
     return ss.concat_vec_envs_v1(rows, n_worlds, num_cpus=1, base_class="stable_baselines3")
 
 
@@ -154,6 +194,9 @@ def _settings(args: argparse.Namespace, task: Task, n_agents: int) -> dict[str, 
 
 def _ours(args: argparse.Namespace, task: Task) -> Contender:
     env = share_parameters(task.make_env, n_worlds=args.worlds)
+    against = opponent_env(env)
+    if against is not None:
+        against.set_opponent("random")
     model = MAPPO(
         "GruPolicy" if args.policy == "gru" else "MlpPolicy",
         env,

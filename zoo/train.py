@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import importlib
 import importlib.util
+import signal
 import sys
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -34,6 +35,13 @@ from sb3_e2c.zoo.console import (
     one_line_errors,
 )
 from sb3_e2c.zoo.experiment import TeamExperimentManager, configure, register
+from sb3_e2c.zoo.resume import (
+    Interrupted,
+    NothingToDo,
+    how_to_go_on,
+    resumed_arguments,
+    stop_signals,
+)
 
 _PAIRS = {"action": StoreDict, "metavar": "KEY:VALUE"}
 # RL-Zoo's flags that mean something else here, or read their values as data instead of code
@@ -105,8 +113,38 @@ class TrainParser(ConsoleParser):
             metavar="NAME,NAME",
             help=f"Named overrides, to be combined: {', '.join(preset_names())}",
         )
-        args = super().parse_args(self.argv)
+        self.add_argument(
+            "--opponent",
+            default="own",
+            metavar="own|random|FILE",
+            help="Who plays against the team, where somebody does: an adversary that learns, too "
+            "(own, the default), random actions, or a saved adversary that learns no more",
+        )
+        self.add_argument(
+            "--resume",
+            default="",
+            metavar="RUN",
+            help="Go on with an interrupted run, for instance logs/e2c_t/MultiRover-6-3-v0_1, with "
+            "its own settings (-n may be another total); worlds in a batched simulator give the "
+            "same result as without the interruption. Your own runs only: it unpickles their state",
+        )
+        self.add_argument(
+            "--resume-every",
+            type=float,
+            default=60.0,
+            metavar="SECONDS",
+            help="How often to write a resume point to the disk, at the end of a rollout "
+            "(default: 60; 0: always). A stopped run writes its latest in any case",
+        )
+        defaults = vars(super().parse_args([]))
+        unset = object()
+        typed = super().parse_args(self.argv, argparse.Namespace(**dict.fromkeys(defaults, unset)))
+        given = {name: value for name, value in vars(typed).items() if value is not unset}
         with one_line_errors():
+            args = argparse.Namespace(**defaults | given)
+            if "resume" in given:
+                flags = {each.dest: each.option_strings[-1] for each in self._actions}
+                args = resumed_arguments(Path(args.resume), given, defaults, flags)
             _check(args)
         return args
 
@@ -140,6 +178,10 @@ def _check(args: argparse.Namespace) -> None:
         check_writable(args.tensorboard_log, "--tensorboard-log")
     if args.trained_agent and not zipfile.is_zipfile(args.trained_agent):
         raise UserError(f"-i {args.trained_agent}: expected the .zip file of a saved model")
+    if args.opponent not in ("own", "random") and not zipfile.is_zipfile(args.opponent):
+        raise UserError(
+            f"--opponent is {args.opponent}; expected own, random, or the .zip file of an adversary"
+        )
     configure(args)
 
 
@@ -158,6 +200,8 @@ def _check_numbers(args: argparse.Namespace) -> None:
             raise UserError(f"{flag} is {getattr(args, name)}; expected at least {least}")
     if args.n_timesteps != -1 and args.n_timesteps < 1:
         raise UserError(f"--n-timesteps is {args.n_timesteps}; expected at least 1")
+    if not args.resume_every >= 0:
+        raise UserError(f"--resume-every is {args.resume_every}; expected at least 0 seconds")
     if args.seed >= 2**32:
         raise UserError(f"--seed is {args.seed}; expected less than 2**32")
     if args.log_interval == 0:
@@ -192,10 +236,26 @@ def train(argv: Sequence[str]) -> Path:
     :param argv: Flags, as after ``sb3-e2c train``
     :return: The folder of the run
     :raises UserError: for mistakes that only show when the run is built
+    :raises Interrupted: (a ``SystemExit``) if Ctrl-C or SIGTERM stopped it; what it had learned is
+        saved, and ``--resume`` goes on
     """
-    with _our_zoo(argv) as managers:
-        rl_zoo3.train.train()
-    return Path(managers[-1].save_path)
+    with stop_signals(), _our_zoo(argv) as managers:
+        try:
+            rl_zoo3.train.train()
+        except NothingToDo as news:
+            print(news)
+        except KeyboardInterrupt as stop:  # before or after the training itself
+            print(f"Interrupted ({stop})", file=sys.stderr)
+            raise Interrupted(getattr(stop, "number", signal.SIGINT)) from None
+        finally:
+            for manager in managers:
+                manager.points.close()
+    manager = managers[-1]
+    if manager.stopped_by is not None:
+        if manager.points.latest is not None:
+            print(f"Go on with: {how_to_go_on(Path(manager.save_path))}")
+        raise Interrupted(manager.stopped_by)
+    return Path(manager.save_path)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

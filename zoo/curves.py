@@ -1,8 +1,6 @@
-"""Learning curves of a run: team reward, team cost and multipliers over agent steps."""
+"""Learning curves of one run: team reward, team cost and multipliers over agent steps."""
 
-import argparse
 import io
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,13 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_e2c.zoo.configuration import read_yaml, team_limits
-from sb3_e2c.zoo.console import (
-    ConsoleParser,
-    UserError,
-    check_file,
-    one_line_errors,
-    write_whole,
-)
+from sb3_e2c.zoo.console import UserError, check_file, write_whole
+from sb3_e2c.zoo.figures import tidy
+from sb3_e2c.zoo.results import agent_steps, read_table
 
 WINDOW = 100  # episodes, as in the paper's figures
 _BLUE, _RED, _GREEN = "#1f6f9f", "#b5403a", "#3a7d44"
@@ -37,9 +31,9 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
     out = folder / "learning.png" if out is None else Path(out)
     check_file(out, "--out")
     args, config = _settings(folder)
-    progress = _read(folder / "progress.csv")
-    episodes = _read(folder / "monitor.csv", comment="#")
-    steps = _agent_steps(episodes, progress)
+    progress = read_table(folder / "progress.csv")
+    episodes = read_table(folder / "monitor.csv", comment="#")
+    steps = agent_steps(episodes, progress)
     figure = Figure(figsize=(12, 3.6), layout="constrained", dpi=150)
     reward, cost, multipliers = figure.subplots(1, 3)
     figure.suptitle(f"{args['algo']} on {args['env']}, seed {args['seed']}")
@@ -47,14 +41,13 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
     reward.set_title("team reward of an episode")
     names = [name for name in episodes.columns if name.startswith("cost")]
     for number, name in enumerate(names):
-        _curve(
-            cost, steps, episodes[name], _RED, name if len(names) > 1 else None, 1 - 0.3 * number
-        )
+        label = name if len(names) > 1 else None
+        _curve(cost, steps, episodes[name], _RED, label, 1 - 0.3 * number)
     _draw_limits(cost, team_limits(args["env"], config), config.get("cost_limits") is not None)
     cost.set_title("team cost of an episode")
     _draw_multipliers(multipliers, progress)
     for axes in (reward, cost, multipliers):
-        _tidy(axes)
+        tidy(axes)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     write_whole(out, picture.getvalue())
@@ -67,25 +60,6 @@ def _settings(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if len(found) != 1:
         raise UserError(f"{folder} is not the folder of one run: it has no */args.yml")
     return read_yaml(found[0]), read_yaml(found[0].with_name("config.yml"))
-
-
-def _read(path: Path, **options: Any) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path, **options)
-    except (OSError, ValueError) as error:  # EmptyDataError is a ValueError
-        raise UserError(f"cannot read {path}: {error}") from None
-    if table.empty:
-        raise UserError(f"{path} is empty; has the run finished an episode?")
-    return table
-
-
-def _agent_steps(episodes: pd.DataFrame, progress: pd.DataFrame) -> np.ndarray:
-    """Agent steps at the end of each episode, all worlds running side by side."""
-    counters = progress[["time/total_timesteps", "time/env_steps"]].dropna()
-    first, steps = counters.iloc[0], episodes["l"].cumsum().to_numpy()
-    n_agents = round(first["time/total_timesteps"] / first["time/env_steps"])
-    before = counters["time/total_timesteps"].iloc[-1] - n_agents * steps[-1]  # a continued run
-    return n_agents * steps + max(before, 0)
 
 
 def _curve(
@@ -122,30 +96,3 @@ def _draw_multipliers(axes: Axes, progress: pd.DataFrame) -> None:
     elif len(names) > 1:
         axes.legend(frameon=False)
     axes.set_title("Lagrange multiplier λ")
-
-
-def _tidy(axes: Axes) -> None:
-    axes.set_xlabel("agent steps")
-    axes.set_xlim(left=0)
-    if axes.dataLim.ymin >= 0:
-        axes.set_ylim(bottom=0)
-    axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0), useMathText=True)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Console command ``sb3-e2c plots``.
-
-    :param argv: Flags; default: those of this process
-    """
-    parser: argparse.ArgumentParser = ConsoleParser(prog="sb3-e2c plots", description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of the run")
-    parser.add_argument("-o", "--out", type=Path, help="picture (default: learning.png there)")
-    args = parser.parse_args(sys.argv[1:] if argv is None else argv)
-    with one_line_errors():
-        print(plot_learning(args.run, args.out))
-
-
-if __name__ == "__main__":
-    main()
