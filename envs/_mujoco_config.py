@@ -105,6 +105,16 @@ class RobotConfig:
                 f"walls is 'free' with {self.scenario}, whose walls nothing can reach; expected "
                 "'visual' or 'none'"
             )
+        if self.strict_outside and (self.scenario != "Ant" or self.cost_mode != "hazard"):
+            raise ValueError(
+                f"strict_outside is True with {self.scenario} and cost_mode {self.cost_mode!r}; "
+                "expected the Ant's walls, cost_mode='hazard'"
+            )
+        if self.agent_obsk != 1 and self.obs_mode != "obsk":
+            raise ValueError(
+                f"agent_obsk is {self.agent_obsk} with obs_mode {self.obs_mode!r}, in which every "
+                "agent sees everything; expected obs_mode='obsk'"
+            )
         if self.per_vector_norm and self.obs_mode != "full":
             raise ValueError(
                 f"per_vector_norm is True with obs_mode {self.obs_mode!r}; expected 'full', the "

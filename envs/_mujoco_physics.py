@@ -64,6 +64,11 @@ class Physics:
             future.result()
         return now
 
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
     def _step(self, worlds: list[int], controls: np.ndarray, now: Snapshot) -> None:
         """Step some worlds one after the other; MuJoCo computes outside of Python's lock."""
         for world in worlds:

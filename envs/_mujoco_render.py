@@ -55,13 +55,20 @@ class Painter:
         with _headless():
             if self._renderer is None:
                 self._renderer = _open(self.model, self.data)
+            self._take_context()
             return self._renderer.render("rgb_array")
 
     def close(self) -> None:
         """Release the OpenGL context."""
         if self._renderer is not None:
+            self._take_context()
             self._renderer.close()
             self._renderer = None
+
+    def _take_context(self) -> None:
+        """Direct OpenGL to this painter: others may have drawn since."""
+        if self._renderer.viewer is not None:  # made at the first picture
+            self._renderer.viewer.make_context_current()
 
 
 def _open(model: mujoco.MjModel, data: mujoco.MjData) -> Any:

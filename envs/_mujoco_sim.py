@@ -174,6 +174,7 @@ class RobotSimulator:
         if self._painter is not None:
             self._painter.close()
             self._painter = None
+        self._physics.close()
 
     def __getstate__(self) -> dict[str, Any]:
         """The whole state: numbers and random streams, not what :meth:`_build` makes again."""

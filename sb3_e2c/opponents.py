@@ -222,6 +222,10 @@ class LearningOpponents(Opponents):
         self._finished.extend(self._returns[ended])
         self._returns[ended] = 0.0
 
+    def stop_rollout(self) -> None:
+        """Collect no more: what has been collected is given up."""
+        self._collecting = False
+
     def finish_rollout(self, logger: Logger) -> None:
         """Compute the advantages of a whole rollout.
 

@@ -10,11 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.distributions import (
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+)
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
+from torch.distributions import Categorical, Normal
 
 from sb3_e2c.sequences import Memory, Sequences
 
@@ -250,14 +254,32 @@ class TeamPolicy(ActorCriticPolicy):
         n_steps = len(observations)
         pi_features, vf_features = self._slot_features(observations)
         latent_pi = self._actor_latent(pi_features, sequences)
-        distribution = self._get_action_dist_from_latent(latent_pi)
-        log_prob = distribution.log_prob(self._flatten_actions(actions))
-        entropy = distribution.entropy()
-        if entropy is None:  # no analytical form: estimate it from the actions taken
-            entropy = -log_prob
+        log_prob, entropy = self._rate(latent_pi, self._flatten_actions(actions))
         shape = (n_steps, self.n_agents)
         critics = self._critics(vf_features, critic_states, sequences)
         return StepEvaluation(log_prob.view(shape), entropy.view(shape), *critics)
+
+    def _rate(self, latent_pi: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Log-probabilities of actions, and entropies.
+
+        The same numbers as from Stable-Baselines3's distributions, without torch's checks of their
+        arguments, which take as long; a loss that is not finite stops the training anyway.
+
+        :param latent_pi: Last hidden layer of the actor, shape (S, H)
+        :param actions: Shape (S, A), or (S,) if discrete
+        :return: Shape (S,) each
+        """
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            mean = self.action_net(latent_pi)
+            normal = Normal(mean, th.ones_like(mean) * self.log_std.exp(), validate_args=False)
+            return normal.log_prob(actions).sum(dim=1), normal.entropy().sum(dim=1)
+        if isinstance(self.action_dist, CategoricalDistribution):
+            categorical = Categorical(logits=self.action_net(latent_pi), validate_args=False)
+            return categorical.log_prob(actions), categorical.entropy()
+        distribution = self._get_action_dist_from_latent(latent_pi)
+        log_prob, entropy = distribution.log_prob(actions), distribution.entropy()
+        # without an analytical form it is estimated from the actions taken
+        return log_prob, -log_prob if entropy is None else entropy
 
     def team_values(
         self,

@@ -168,7 +168,7 @@ def _parts(model: MAPPO, callback: BaseCallback, episodes: bool) -> Iterator[tup
     assert model.env is not None
     yield from _model_parts("model", model)
     yield from _env_parts("env", model.env)
-    yield from _callback_parts("callback", callback, episodes)
+    yield from _callback_parts("callback", callback, model.env, episodes)
 
 
 def _model_parts(name: str, model: MAPPO) -> Iterator[tuple[str, Any]]:
@@ -192,18 +192,21 @@ def _env_parts(name: str, env: VecEnv) -> Iterator[tuple[str, Any]]:
             yield from _model_parts(f"{name}.opponent", acting.model)
 
 
-def _callback_parts(name: str, callback: BaseCallback, episodes: bool) -> Iterator[tuple[str, Any]]:
+def _callback_parts(
+    name: str, callback: BaseCallback, training_env: VecEnv, episodes: bool
+) -> Iterator[tuple[str, Any]]:
     yield name, callback
     for attribute, value in vars(callback).items():
         if attribute in _LINKS:
             continue
         inner = f"{name}.{attribute}"
-        if isinstance(value, VecEnv) and value.unwrapped is not callback.training_env.unwrapped:
+        if isinstance(value, VecEnv) and value.unwrapped is not training_env.unwrapped:
             yield from _env_parts(inner, value)
         for number, child in enumerate(value if isinstance(value, (list, tuple)) else [value]):
             if isinstance(child, BaseCallback):
                 kind = type(child).__name__
-                yield from _callback_parts(f"{inner}.{number}.{kind}", child, episodes)
+                child_name = f"{inner}.{number}.{kind}"
+                yield from _callback_parts(child_name, child, training_env, episodes)
     if isinstance(callback, OEMRewardCallback) and episodes:
         yield f"{name}.{type(callback.estimator).__name__}", callback.estimator
 

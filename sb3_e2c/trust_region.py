@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,7 +128,11 @@ class TrustRegionMonitor(BaseCallback):
         self.max_cost = None if max_cost is None else np.atleast_1d(max_cost)
         for number in [] if self.max_cost is None else self.max_cost.tolist():
             _check_amount("max_cost", number)
-        _check_amount("min_sample_size", min_sample_size)
+        if self.max_cost is not None and not self.max_cost.all():
+            raise ValueError(f"max_cost is {max_cost!r}; expected numbers above 0")
+        if min_sample_size is None:
+            raise ValueError("min_sample_size is None; expected a share, 0 to 1")
+        _check_amount("min_sample_size", min_sample_size, most=1.0)
         _check_amount("max_joint_kl", max_joint_kl)
         _check_amount("max_excess", max_excess)
         self.min_sample_size = min_sample_size
@@ -290,9 +295,9 @@ class TrustRegionMonitor(BaseCallback):
     def _report_update(self) -> None:
         """Log what the update from the last rollout has done; nothing if there was none."""
         rollout, self._learned_from = self._learned_from, None
-        self._predicted = {}
         if rollout is None:
             return
+        self._predicted = {}
         step = self._measure(rollout)
         self._report_step(rollout, step)
         if self._limits_epochs:
@@ -538,9 +543,10 @@ def _key(name: str, what: str) -> str:
     return f"{name}_{what}" if name else what
 
 
-def _check_amount(name: str, number: Any) -> None:
+def _check_amount(name: str, number: Any, most: float = math.inf) -> None:
     if number is None:
         return
-    is_number = isinstance(number, int | float) and not isinstance(number, bool)
-    if not (is_number and 0 <= number < math.inf):
-        raise ValueError(f"{name} is {number!r}; expected a number of at least 0")
+    is_number = isinstance(number, Real) and not isinstance(number, bool)
+    if not (is_number and 0 <= number <= most) or number == math.inf:
+        highest = "" if most == math.inf else f" and at most {most:g}"
+        raise ValueError(f"{name} is {number!r}; expected a number of at least 0{highest}")

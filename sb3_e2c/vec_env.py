@@ -295,6 +295,7 @@ class OpponentVecEnv(MultiAgentVecEnv):
     ):
         super().__init__(worlds, critic_state_dim, team_return, team_cost)
         self.opponent: Opponent | None = None
+        self.deterministic_opponent = False
         self.chosen = False  # whether by set_opponent, and not by an algorithm or an evaluation
 
     @property
@@ -345,7 +346,7 @@ class OpponentVecEnv(MultiAgentVecEnv):
         else:
             check_fits(opponent, self.opponents)
             acting = TrainedOpponents(self.opponents, self.n_worlds, opponent, deterministic)
-        self.opponent = opponent
+        self.opponent, self.deterministic_opponent = opponent, deterministic
         self.worlds.let_act(acting)
 
 

@@ -67,7 +67,6 @@ def test_environments_know_nothing_of_learning(path):
         "recurrent",
         "sides",
         "opponents",
-        "vec_env",
     ],
 )
 def test_adapters_do_not_know_the_algorithm(module):

@@ -38,6 +38,14 @@ def test_team_cost_is_the_sum_over_agents_or_their_maximum():
     assert constraints.party_costs(agent_costs, "individual", "sum") is agent_costs
 
 
+def test_agents_that_report_one_cost_share_it():
+    agent_costs = np.array([[[6.0], [6.0]]])  # a robot's cost, from both of its halves
+    shares = constraints.party_costs(agent_costs, "individual", "max")
+    assert shares.tolist() == [[[3.0], [3.0]]]
+    limits = constraints.party_limits(np.array([6.0]), n_parties=2)
+    assert constraints.violation(shares, limits).tolist() == [[0.0], [0.0]]
+
+
 def test_violation_is_the_mean_episode_cost_minus_the_limit():
     episodes = np.array([[[10.0]], [[20.0]]])
     assert constraints.violation(episodes, np.array([[12.0]])).tolist() == [[3.0]]

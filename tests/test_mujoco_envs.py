@@ -819,3 +819,17 @@ def test_a_mujoco_that_cannot_be_imported_says_so_in_one_line():
     )
     last = result.stderr.strip().splitlines()[-1]
     assert re.fullmatch(r"OSError: MuJoCo cannot .*MUJOCO_GL='nothing'.*unset MUJOCO_GL.*", last)
+
+
+def test_pictures_of_several_environments_do_not_mix():
+    first, second = (
+        safe_mamujoco_v0.parallel_env(scenario=robot, render_mode="rgb_array") for robot in ROBOTS
+    )
+    for env in (first, second):
+        env.reset(seed=0)
+    alone = first.render()
+    second.render()
+    np.testing.assert_array_equal(first.render(), alone)
+    second.close()
+    np.testing.assert_array_equal(first.render(), alone)
+    first.close()

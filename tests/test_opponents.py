@@ -1109,3 +1109,48 @@ def test_the_adversarys_counters_are_saved(tmp_path):
     model.save(tmp_path / "team")
     loaded = MAPPO.load(tmp_path / "team", env=games(), device="cpu")
     assert loaded.opponent._n_updates == model.opponent._n_updates == 4
+
+
+def test_a_missing_adversary_is_missed_every_time(tmp_path):
+    make().learn(32).save(tmp_path / "team")
+    (tmp_path / "team.adversary.zip").unlink()
+    model = MAPPO.load(tmp_path / "team", device="cpu")
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError, match="no adversary beside the team"):
+            model.set_env(games())
+
+
+def test_who_has_learned_beside_the_team_is_saved_whoever_acts_now(tmp_path):
+    model = make().learn(32)
+    model.env.unwrapped.set_opponent("random")
+    model.save(tmp_path / "team")
+    loaded = MAPPO.load(tmp_path / "team", env=games(), device="cpu")
+    assert same_weights(loaded.opponent, model.opponent)
+    env = games()
+    env.set_opponent("random")
+    MAPPO.load(tmp_path / "team", env=env, device="cpu").save(tmp_path / "copy")
+    again = MAPPO.load(tmp_path / "copy", env=games(), device="cpu")
+    assert same_weights(again.opponent, model.opponent)
+
+
+def test_another_teams_adversary_is_not_left_beside_a_team(tmp_path):
+    make().learn(32).save(tmp_path / "team")
+    env = games()
+    env.set_opponent("random")
+    make(env).learn(32).save(tmp_path / "team")
+    assert not (tmp_path / "team.adversary.zip").exists()
+
+
+def test_evaluations_meet_opponents_that_decide_as_in_training():
+    env, eval_env = games(), games(seed=9)
+    env.set_opponent(make().opponent, deterministic=True)
+    make(env).learn(32, callback=TeamEvalCallback(eval_env, eval_freq=8, verbose=0))
+    assert eval_env.worlds.opponents.deterministic
+
+
+def test_a_stopped_rollout_collects_no_more():
+    model = make()
+    model.learn(32, callback=lambda *_: model.num_timesteps < 8)
+    steps = model.opponent.num_timesteps
+    evaluate_team(model, model.env, n_episodes=2)
+    assert model.opponent.num_timesteps == steps

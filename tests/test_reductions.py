@@ -10,6 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_e2c import MAPPO
+from sb3_e2c.policies import TeamPolicy
 
 SETTINGS = {"n_steps": 64, "batch_size": 16, "n_epochs": 3, "gamma": 0.9, "seed": 3}
 
@@ -28,8 +29,8 @@ def single_agent(env_id="CartPole-v1", max_steps=20):
     return DummyVecEnv([lambda: Monitor(ActionCost(TimeLimit(env, max_steps)))])
 
 
-def learned(algorithm, env, **kwargs):
-    model = algorithm("MlpPolicy", env, device="cpu", **{**SETTINGS, **kwargs})
+def learned(algorithm, env, policy="MlpPolicy", **kwargs):
+    model = algorithm(policy, env, device="cpu", **{**SETTINGS, **kwargs})
     return model.learn(64 * 4)
 
 
@@ -68,15 +69,39 @@ def test_the_comparison_with_ppo_can_fail():
         assert_same_parameters(ours, ppo, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("policy", ["MlpPolicy", "GruPolicy"])
 @pytest.mark.parametrize("scope", ["team", "individual"])
-def test_with_lambda_zero_it_is_mappo_bit_for_bit(scope):
-    constrained = learned(MAPPO, single_agent(), cost_limits=np.inf, cost_scope=scope)
+def test_with_lambda_zero_it_is_mappo_bit_for_bit(scope, policy):
+    constrained = learned(MAPPO, single_agent(), policy, cost_limits=np.inf, cost_scope=scope)
     assert constrained.multipliers.values.item() == 0.0
-    assert_same_parameters(constrained, learned(MAPPO, single_agent()))
+    assert_same_parameters(constrained, learned(MAPPO, single_agent(), policy))
 
 
-def test_for_one_agent_team_and_individual_constraints_are_the_same():
-    team = learned(MAPPO, single_agent(), cost_limits=2.0, cost_scope="team")
-    individual = learned(MAPPO, single_agent(), cost_limits=2.0, cost_scope="individual")
+@pytest.mark.parametrize("policy", ["MlpPolicy", "GruPolicy"])
+def test_for_one_agent_team_and_individual_constraints_are_the_same(policy):
+    team, individual = (
+        learned(MAPPO, single_agent(), policy, cost_limits=2.0, cost_scope=scope)
+        for scope in ("team", "individual")
+    )
     assert team.multipliers.values.item() == individual.multipliers.values.item() > 0
     assert_same_parameters(team, individual)
+    ours, theirs = team.policy.state_dict(), individual.policy.state_dict()
+    assert all(ours[name].equal(theirs[name]) for name in theirs)  # the cost critics, too
+
+
+@pytest.mark.parametrize(
+    "space",
+    [gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3), gym.spaces.MultiDiscrete([2, 3])],
+    ids=["continuous", "discrete", "several discrete"],
+)
+def test_actions_are_rated_as_by_stable_baselines3_bit_for_bit(space):
+    # ours leaves out the checks of torch's distributions
+    observations = gym.spaces.Box(-1.0, 1.0, (4,))
+    policy = TeamPolicy(observations, space, lambda _: 1e-3)
+    latent = th.randn(50, 64, generator=th.Generator().manual_seed(0))
+    space.seed(0)
+    actions = th.as_tensor(np.array([space.sample() for _ in range(50)]))
+    log_prob, entropy = policy._rate(latent, actions)
+    distribution = policy._get_action_dist_from_latent(latent)
+    assert log_prob.equal(distribution.log_prob(actions))
+    assert entropy.equal(distribution.entropy())

@@ -24,23 +24,23 @@ from sb3_e2c.zoo import resume, train
 from sb3_e2c.zoo.configuration import read_yaml
 from sb3_e2c.zoo.resume import FOLDER, KeepPoints, ProgressFile, newest_point, read_point
 
-ROLLOUT = (
-    240  # agent steps: 2 worlds of 6 rovers for 20 steps; episodes have 80, so rollouts cut them
-)
-TOTAL = 6 * ROLLOUT
+ROLLOUT = 240  # 2 worlds of 6 rovers for 20 steps; episodes have 15, so that rollouts cut them
+TOTAL = 5 * ROLLOUT
 SMALL = ["n_envs:2", "n_epochs:2", "batch_size:120", "policy_kwargs.net_arch:[8]"]
-ROVERS = ["--env", "MultiRover-6-3-v0", "-params", *SMALL, "n_steps:20", "env_kwargs.max_cycles:15"]
-PREY = ["--env", "PredatorPrey-v0", "-params", *SMALL, "n_steps:40"]  # 2 worlds of 3 predators
+ROVERS = ["--env", "MultiRover-6-3-v0", "-params", *SMALL, "n_steps:20", "cost_limits:0.1"]
+ROVERS += ["env_kwargs.max_cycles:15", "env_kwargs.add_critic_state:true"]
+PREY = ["--env", "PredatorPrey-v0", "-params", *SMALL, "n_steps:40", "env_kwargs.max_cycles:30"]
 CLOCKS = {"t", "time/fps", "time/time_elapsed"}
 
 CASES = {
     "rovers": ["--algo", "e2c_t", *ROVERS],
     "rovers, individual limits, GRU": [
-        *("--algo", "e2c", *ROVERS, "policy:GruPolicy", "multipliers_class:PIDMultipliers"),
-        "callback:sb3_e2c.TrustRegionMonitor",
+        *("--algo", "e2c", "--log-interval", "2", *ROVERS, "policy:GruPolicy"),
+        *("multipliers_class:PIDMultipliers", "callback:sb3_e2c.TrustRegionMonitor"),
     ],
     "predators and a learning prey": ["--algo", "e2c_t", *PREY, "normalize:True"],
     "predators and a learning prey, GRU": ["--algo", "e2c_t", *PREY, "policy:GruPolicy"],
+    "predators and a random prey": ["--algo", "mappo", "--opponent", "random", *PREY],
 }
 
 

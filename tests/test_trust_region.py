@@ -13,7 +13,7 @@ import torch as th
 from conftest import TwoOnALine
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.distributions import (
     Distribution,
     make_proba_distribution,
@@ -579,3 +579,18 @@ def test_a_yaml_can_name_it(tmp_path):
     header = (folder / "progress.csv").read_text()
     assert "bounds/joint" in header
     assert "bounds/agent_5" in header
+
+
+def test_an_interrupted_training_leaves_nothing_behind():
+    model = MAPPO("MlpPolicy", share_parameters(TwoOnALine, n_worlds=2), n_steps=8, batch_size=16)
+
+    def interrupt(local, _):
+        if local["self"].num_timesteps > 40:
+            raise KeyboardInterrupt
+        return True
+
+    monitor = TrustRegionMonitor(max_joint_kl=1.0)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, callback=[monitor, ConvertCallback(interrupt)])
+    model.learn(64)
+    assert model.stop_epochs is None

@@ -523,7 +523,7 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
     text = capsys.readouterr().out
     assert "--preset" in text
     assert "--save-freq" in text
-    for flag in ("--n-trials", "-optimize", "--storage", "--save-replay-buffer"):
+    for flag in ("--n-trials", "-optimize", "--sampler", "--save-replay-buffer"):
         assert flag not in text
 
 

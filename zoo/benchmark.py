@@ -47,7 +47,10 @@ def make_parser() -> ConsoleParser:
     parser = ConsoleParser(
         prog="sb3-e2c benchmark",
         description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples=[
+            "sb3-e2c benchmark --suite smoke -f benchmark --jobs 2",
+            "sb3-e2c benchmark --suite paper -f benchmark --ray local --seeds 0-4",
+        ],
     )
     add = parser.add_argument
     names = ", ".join(suite_names())

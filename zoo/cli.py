@@ -11,10 +11,14 @@ COMMANDS = {
     "enjoy": "evaluate a trained team",
     "record": "film a trained team, or what it learned",
     "export": "write the actor as an ONNX file, to act without torch",
+    "push": "publish a trained team on the Hugging Face hub",
+    "load": "fetch a team from the Hugging Face hub",
     "demo": "train, evaluate and film one team in a few minutes",
     "benchmark": "run the experiments of a suite, on one machine or many",
     "plot": "draw the curves of a run, or the figures of a benchmark",
+    "tune": "search for hyperparameters",
     "speed": "train beside other libraries and compare the speed",
+    "completion": "print a script that completes flags in bash or zsh",
 }
 
 
@@ -25,8 +29,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     command, *flags = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     if command in ("-h", "--help"):
-        print("usage: sb3-e2c COMMAND [FLAGS]; each command has --help\n")
-        print("\n".join(f"  {name:<6} {text}" for name, text in COMMANDS.items()))
+        print("usage: sb3-e2c COMMAND [FLAGS]; COMMAND --help shows its flags and examples\n")
+        print("\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items()))
     elif command not in COMMANDS:
         fail(unknown("command", command, COMMANDS))
     else:

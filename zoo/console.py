@@ -61,10 +61,23 @@ def one_line_errors() -> Iterator[None]:
 
 
 class ConsoleParser(argparse.ArgumentParser):
-    """An argument parser that reports mistakes in one line."""
+    """An argument parser that reports mistakes in one line, and whose help ends with examples.
+
+    :param examples: Command lines, each with a comment if it needs one
+    :param kwargs: As for ``ArgumentParser``
+    """
+
+    def __init__(self, *, examples: Sequence[str] = (), **kwargs: Any):
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        if examples:
+            kwargs["epilog"] = "\n  ".join(["examples:", *examples])
+        super().__init__(**kwargs)
 
     def error(self, message: str) -> NoReturn:
-        """See :func:`fail`."""
+        """See :func:`fail`; an unknown flag gets the nearest one beside it."""
+        stranger = re.match(r"unrecognized arguments: (-[^\s=]+)", message)
+        if stranger:
+            fail(unknown("flag", stranger[1], self._option_string_actions))
         fail(message)
 
 

@@ -28,7 +28,11 @@ EPISODES = WORLDS = 100
 
 def make_parser() -> ConsoleParser:
     """The flags of the demo."""
-    parser = ConsoleParser(prog="sb3-e2c demo", description=__doc__)
+    parser = ConsoleParser(
+        prog="sb3-e2c demo",
+        description=__doc__,
+        examples=["sb3-e2c demo -n 500_000 --seed 1 -f logs"],
+    )
     parser.add_argument("-n", "--n-timesteps", type=int, help="agent steps (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
     parser.add_argument("-f", "--log-folder", default="logs", help="log folder (default: logs)")

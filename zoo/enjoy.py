@@ -44,7 +44,14 @@ from sb3_e2c.zoo.runs import (
 
 def make_parser() -> ConsoleParser:
     """The flags of ``enjoy``: RL-Zoo's names, and ``--n-episodes --json --video --trust``."""
-    parser = ConsoleParser(prog="sb3-e2c enjoy", description=(__doc__ or "").split("\n\n")[1])
+    parser = ConsoleParser(
+        prog="sb3-e2c enjoy",
+        description=(__doc__ or "").split("\n\n")[1],
+        examples=[
+            "sb3-e2c enjoy --algo e2c_t --env MultiRover-6-3-v0 -f logs --video team.gif",
+            "sb3-e2c enjoy --algo e2c_t --env PredatorPrey-v0 --opponent own random --json a.json",
+        ],
+    )
     add, switch = parser.add_argument, "store_true"
     add_run_flags(parser)
     add("--n-episodes", type=int, default=100, help="episodes of the team (default: 100)")

@@ -322,8 +322,9 @@ class TeamExperimentManager(ExperimentManager):
             ignore_stop_signals()
             self.stopped_by = getattr(stop, "number", signal.SIGINT)
             print(f"Interrupted at {model.num_timesteps:,} agent steps: saving")
-        except (ValueError, RuntimeError, MemoryError) as error:
-            self.points.write()
+        except (ValueError, RuntimeError, MemoryError, OSError) as error:
+            with contextlib.suppress(OSError):  # the disk may be full
+                self.points.write()
             raise UserError(
                 f"training stopped: {brief(error)}; {self.save_path} keeps what was saved before"
             ) from error

@@ -16,7 +16,6 @@ import platform
 import sys
 import warnings
 import zipfile
-from argparse import RawDescriptionHelpFormatter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from importlib import import_module, metadata
@@ -55,10 +54,6 @@ OPSET = 17  # of onnxruntime 1.12 and later
 TOLERANCE = 1e-5
 CHECKED_WORLDS = 4  # an episode of each is compared with torch
 
-_EXAMPLES = """example:
-  sb3-e2c export --algo e2c_t --env MultiRover-6-3-v0 -f logs --load-best -o actor
-docs/export.md drives an agent with the two files, onnxruntime and numpy.
-"""
 _PACKAGES = ("sb3_e2c", "stable_baselines3", "torch", "onnx", "onnxruntime", "numpy")
 
 
@@ -67,8 +62,10 @@ def make_parser() -> ConsoleParser:
     parser = ConsoleParser(
         prog="sb3-e2c export",
         description=(__doc__ or "").split("\n\n")[1],
-        epilog=_EXAMPLES,
-        formatter_class=RawDescriptionHelpFormatter,
+        examples=[
+            "sb3-e2c export --algo e2c_t --env MultiRover-6-3-v0 -f logs --load-best -o actor",
+            "# docs/export.md drives an agent with the two files, onnxruntime and numpy",
+        ],
     )
     add = parser.add_argument
     add_run_flags(parser)

@@ -28,7 +28,7 @@ from sb3_e2c.zoo import enjoy, train
 from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import UserError, one_line_errors
 from sb3_e2c.zoo.results import MODES, Place, read_json, read_table, write_curve, write_json
-from sb3_e2c.zoo.resume import newest_point
+from sb3_e2c.zoo.resume import Interrupted, newest_point
 from sb3_e2c.zoo.suite import Job
 
 BUSY, INTERRUPTED = 75, 76  # exit statuses: another process works on it; stopped before its end
@@ -102,8 +102,11 @@ def _train_and_evaluate(place: Place) -> int:
     limits = team_limits(place.job.env, config)
     _forget_other_settings(place)
     if not _trained(place, config):
-        with _curve_while_running(place, limits):
-            train.train(continue_or_restart(place))
+        try:
+            with _curve_while_running(place, limits):
+                train.train(continue_or_restart(place))
+        except Interrupted:
+            return INTERRUPTED
         if not _trained(place, config):
             return INTERRUPTED
     write_curve(place, limits)

@@ -1,11 +1,6 @@
 """Draw what has been learned: the curves of one run, or the figures and tables of a benchmark.
 
 A benchmark's figures are drawn from the small files under its results folder alone.
-
-Examples:
-  sb3-e2c plot logs/e2c_t/MultiRover-6-3-v0_1       curves of one run, as a picture in its folder
-  sb3-e2c plot -f benchmark                         every suite in benchmark/results
-  sb3-e2c plot -f results --suite paper -o figures  one suite, from committed results
 """
 
 import argparse
@@ -50,7 +45,11 @@ def make_parser() -> ConsoleParser:
     parser = ConsoleParser(
         prog="sb3-e2c plot",
         description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples=[
+            "sb3-e2c plot logs/e2c_t/MultiRover-6-3-v0_1  # curves of one run, into its folder",
+            "sb3-e2c plot -f benchmark  # every suite in benchmark/results",
+            "sb3-e2c plot -f results --suite paper -o figures  # one suite, from committed results",
+        ],
     )
     add = parser.add_argument
     add("run", nargs="?", type=Path, help="folder of one run of train")

@@ -8,7 +8,6 @@ config.yml and only weights are read from its file (unless you --trust it).
 import argparse
 import re
 import sys
-from argparse import RawDescriptionHelpFormatter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -32,19 +31,16 @@ from sb3_e2c.zoo.console import (
 )
 from sb3_e2c.zoo.runs import Run, add_run_flags, check_seed, find_run, load_model, make_env
 
-_EXAMPLES = """examples:
-  sb3-e2c record --algo e2c_t --env MultiRover-6-3-v0 -f logs -o team.mp4 --n-episodes 3
-  sb3-e2c record --algo e2c_t --env MultiRover-6-3-v0 -f logs -o learning.gif --every-checkpoint
-"""
-
 
 def make_parser() -> ConsoleParser:
     """The flags of ``record``."""
     parser = ConsoleParser(
         prog="sb3-e2c record",
         description=(__doc__ or "").split("\n\n")[1],
-        epilog=_EXAMPLES,
-        formatter_class=RawDescriptionHelpFormatter,
+        examples=[
+            "sb3-e2c record --algo e2c_t --env MultiRover-6-3-v0 -o team.mp4 --n-episodes 3",
+            "sb3-e2c record --algo e2c_t --env MultiRover-6-3-v0 -o gain.gif --every-checkpoint",
+        ],
     )
     add, switch = parser.add_argument, "store_true"
     add_run_flags(parser)

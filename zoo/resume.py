@@ -40,9 +40,7 @@ FOLDER = "resume"
 _SUFFIX = ".point"
 _PACKAGES = ("sb3_e2c", "stable_baselines3", "torch", "numpy", "numba")
 _DIGEST = 64  # hexadecimal digits of a checksum
-_KEEP_EVERY = (
-    1.0  # seconds; a point in memory costs some milliseconds, short rollouts not many more
-)
+_KEEP_EVERY = 1.0  # seconds; a point in memory costs some milliseconds, short rollouts few more
 # What atomic_write leaves when it is killed
 _LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}")
 

@@ -2,7 +2,7 @@
 
 Every contender trains on the same task with the same network widths, epochs and minibatches; they
 take turns, so that a busy machine slows all of them. One agent's step is a step. Ours trains a
-central critic with one output for each agent, and a cost critic; the peers train neither.
+central critic with one output for each agent, and a cost critic; SB3 and sb3-contrib neither.
 """
 
 import argparse
@@ -10,29 +10,41 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import supersuit as ss
 import torch as th
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
-from sb3_contrib import RecurrentPPO
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
-from sb3_e2c.vec_env import opponent_env
-from sb3_e2c.zoo.console import ConsoleParser, UserError, one_line_errors, unknown, write_whole
+from sb3_e2c.vec_env import MultiAgentVecEnv, opponent_env
+from sb3_e2c.zoo.console import (
+    ConsoleParser,
+    UserError,
+    check_file,
+    one_line_errors,
+    unknown,
+    write_whole,
+)
+from sb3_e2c.zoo.peers import (
+    INSTALLED,
+    REPOSITORIES,
+    WIDTH,
+    Learner,
+    Plan,
+    is_installed,
+    sb3,
+    sb3_iteration,
+)
 
-WIDTH = 128
+_CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 @dataclass(frozen=True)
@@ -41,7 +53,14 @@ class Task:
 
     make_env: Callable[[], ParallelEnv]
     rollout: int  # steps of each world
+    episode: int  # steps
     peers_env: Callable[[], ParallelEnv] | None = None  # the team alone; None: as make_env
+    batched: bool = True  # whether ours steps all worlds in one set of arrays
+
+    @property
+    def team_env(self) -> Callable[[], ParallelEnv]:
+        """Makes a world in which only the team acts."""
+        return self.peers_env or self.make_env
 
 
 class RandomOpponents(BaseParallelWrapper):
@@ -96,9 +115,11 @@ def _hunt() -> ParallelEnv:
 
 
 TASKS = {
-    "simple_spread": Task(_simple_spread, rollout=200),
-    "rover": Task(_rover, rollout=80),
-    "predator_prey": Task(_hunt, rollout=200, peers_env=lambda: RandomOpponents(_hunt())),
+    "simple_spread": Task(_simple_spread, rollout=200, episode=25, batched=False),
+    "rover": Task(_rover, rollout=80, episode=80),
+    "predator_prey": Task(
+        _hunt, rollout=200, episode=25, peers_env=lambda: RandomOpponents(_hunt())
+    ),
 }
 
 
@@ -113,43 +134,39 @@ class NoCost(BaseCallback):
 
 @dataclass
 class Contender:
-    """One library, ready to train.
+    """A library that takes its turns.
 
-    :param name: For the table
-    :param model: Its algorithm
-    :param hooks: Share of the time to measure: name, object and method
+    :param learner: The library
+    :param clock: What a second is
     """
 
-    name: str
-    model: OnPolicyAlgorithm
-    hooks: list[tuple[str, Any, str]]
-    callback: BaseCallback | None = None
+    learner: Learner
+    clock: Callable[[], float]
     rates: dict[int, list[float]] = field(default_factory=dict)  # steps / s by number of threads
     seconds: dict[str, float] = field(default_factory=dict)
     total: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, owner, method in self.hooks:
+        for name, owner, method in self.learner.hooks:
             setattr(owner, method, partial(self._timed, name, getattr(owner, method)))
         self.run_iteration()  # compiles, allocates
         self.seconds.clear()
         self.total = 0.0
 
     def _timed(self, name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        start = time.perf_counter()
+        start = self.clock()
         try:
             return function(*args, **kwargs)
         finally:
-            elapsed = time.perf_counter() - start
-            self.seconds[name] = self.seconds.get(name, 0.0) + elapsed
+            self.seconds[name] = self.seconds.get(name, 0.0) + self.clock() - start
 
     def run_iteration(self) -> float:
         """One rollout and one update; returns agent steps per second."""
-        before, start = self.model.num_timesteps, time.perf_counter()
-        self.model.learn(1, callback=self.callback, reset_num_timesteps=False, log_interval=10**9)
-        elapsed = time.perf_counter() - start
+        start = self.clock()
+        steps = self.learner.iterate()
+        elapsed = self.clock() - start
         self.total += elapsed
-        return (self.model.num_timesteps - before) / elapsed
+        return steps / elapsed
 
     def measure(self, threads: int) -> None:
         """Run one iteration with a number of torch threads."""
@@ -166,7 +183,7 @@ class Contender:
         shares = {name: spent / self.total for name, spent in self.seconds.items()}
         threads = max(self.rates, key=lambda n: statistics.median(self.rates[n]))
         return {
-            "name": self.name,
+            "name": self.learner.name,
             "steps_per_second": statistics.median(self.best),
             "min": min(self.best),
             "max": max(self.best),
@@ -176,33 +193,36 @@ class Contender:
         }
 
 
-def _supersuit(task: Task, n_worlds: int) -> VecEnv:
-    """Slots as SuperSuit alone makes them, for the peers."""
-    rows = ss.pettingzoo_env_to_vec_env_v1((task.peers_env or task.make_env)())
-    return ss.concat_vec_envs_v1(rows, n_worlds, num_cpus=1, base_class="stable_baselines3")
+def _plan(args: argparse.Namespace, task: Task) -> Plan:
+    return Plan(
+        make_env=task.team_env,
+        episode=task.episode,
+        policy=args.policy,
+        rollout=task.rollout,
+        n_worlds=args.worlds,
+        n_epochs=args.epochs,
+        n_minibatches=args.minibatches,
+        n_agents=len(task.team_env().possible_agents),
+    )
 
 
-def _settings(args: argparse.Namespace, task: Task, n_agents: int) -> dict[str, Any]:
-    rows = task.rollout * args.worlds * n_agents
-    return {
-        "n_steps": task.rollout,
-        "batch_size": rows // args.minibatches,
-        "n_epochs": args.epochs,
-        "device": "cpu",
-    }
-
-
-def _ours(args: argparse.Namespace, task: Task) -> Contender:
-    env = share_parameters(task.make_env, n_worlds=args.worlds)
+def _our_worlds(task: Task, plan: Plan, same_environment: bool) -> MultiAgentVecEnv:
+    if same_environment:
+        return share_parameters(plan.make_env, plan.n_worlds, backend="supersuit")
+    env = share_parameters(task.make_env, plan.n_worlds)
     against = opponent_env(env)
     if against is not None:
         against.set_opponent("random")
+    return env
+
+
+def _ours(task: Task, plan: Plan, same_environment: bool) -> Learner:
     model = MAPPO(
-        "GruPolicy" if args.policy == "gru" else "MlpPolicy",
-        env,
+        "GruPolicy" if plan.recurrent else "MlpPolicy",
+        _our_worlds(task, plan, same_environment),
         cost_limits=10.0,
-        policy_kwargs={"net_arch": [WIDTH, WIDTH] if args.policy == "mlp" else [WIDTH]},
-        **_settings(args, task, env.n_agents),
+        policy_kwargs={"net_arch": [WIDTH] if plan.recurrent else [WIDTH, WIDTH]},
+        **plan.sb3_settings(),
     )
     hooks = [
         ("environment", model.env, "step"),
@@ -210,29 +230,42 @@ def _ours(args: argparse.Namespace, task: Task) -> Contender:
         ("values", model.rollout_buffer, "finish"),
         ("update", model, "train"),
     ]
-    return Contender(f"sb3-e2c MAPPO ({args.policy})", model, hooks, NoCost())
+    return Learner(f"sb3-e2c MAPPO ({plan.policy})", sb3_iteration(model, NoCost()), hooks)
 
 
-def _peer(args: argparse.Namespace, task: Task) -> Contender:
-    env = _supersuit(task, args.worlds)
-    n_agents = env.num_envs // args.worlds
-    settings = _settings(args, task, n_agents)
-    model: OnPolicyAlgorithm
-    if args.policy == "mlp":
-        name = "SB3 PPO + SuperSuit"
-        kwargs: dict[str, Any] = {"net_arch": [WIDTH, WIDTH]}
-        model = PPO("MlpPolicy", env, policy_kwargs=kwargs, **settings)
-    else:
-        name = "sb3-contrib RecurrentPPO + SuperSuit"
-        kwargs = {"net_arch": [WIDTH], "lstm_hidden_size": WIDTH}
-        model = RecurrentPPO("MlpLstmPolicy", env, policy_kwargs=kwargs, **settings)
-    hooks = [
-        ("environment", model.env, "step"),
-        ("inference", model.policy, "forward"),
-        ("values", model.rollout_buffer, "compute_returns_and_advantage"),
-        ("update", model, "train"),
-    ]
-    return Contender(name, model, hooks)
+def _peers(names: Sequence[str], plan: Plan) -> Iterator[Learner]:
+    """The peers of every run, and those that were asked for.
+
+    :param names: What ``--peer`` was given
+    :param plan: What they train
+    """
+    yield sb3(plan)
+    asked = dict.fromkeys(names)
+    if is_installed("benchmarl") and not plan.recurrent:
+        asked.setdefault("benchmarl")
+    for each in asked:
+        name, _, path = each.partition("=")
+        if name in INSTALLED and not path:
+            yield INSTALLED[name](plan)
+        elif name in REPOSITORIES and path:
+            yield REPOSITORIES[name](plan, Path(path).expanduser().resolve())
+        elif name in REPOSITORIES:
+            raise UserError(f"--peer {name} needs its repository: --peer {name}=PATH")
+        else:
+            raise unknown("peer (--peer)", each, [*INSTALLED, *REPOSITORIES])
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.env not in TASKS:
+        raise unknown("task (--env)", args.env, TASKS)
+    for name in ("worlds", "epochs", "minibatches", "rounds"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name} is {getattr(args, name)}; expected at least 1")
+    if min(args.threads) < 1:
+        raise UserError(f"--threads is {min(args.threads)}; expected at least 1")
+    if args.clock == "cpu" and args.threads != [1]:
+        raise UserError("--clock cpu adds up what all threads use; expected --threads 1 with it")
+    check_file(args.json, "--json")
 
 
 def benchmark(args: argparse.Namespace) -> dict[str, Any]:
@@ -241,13 +274,11 @@ def benchmark(args: argparse.Namespace) -> dict[str, Any]:
     :param args: See :func:`make_parser`
     :return: Settings, results and ratios, as ``--json`` writes them
     """
-    if args.env not in TASKS:
-        raise unknown("task (--env)", args.env, TASKS)
-    for name in ("worlds", "epochs", "minibatches", "rounds"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} is {getattr(args, name)}; expected at least 1")
+    _check(args)
     task = TASKS[args.env]
-    contenders = [_ours(args, task), _peer(args, task)]
+    plan, same = _plan(args, task), args.same_environment or not task.batched
+    learners = [_ours(task, plan, same), *_peers(args.peer, plan)]
+    contenders = [Contender(learner, _CLOCKS[args.clock]) for learner in learners]
     for _ in range(args.rounds):
         for threads in args.threads:
             for contender in contenders:
@@ -256,6 +287,7 @@ def benchmark(args: argparse.Namespace) -> dict[str, Any]:
     ours = results[0]["steps_per_second"]
     return {
         "settings": {**vars(args), "json": None, "torch": th.__version__},
+        "same_environment": same,
         "results": results,
         "ratios": {each["name"]: ours / each["steps_per_second"] for each in results[1:]},
     }
@@ -266,7 +298,14 @@ def table(outcome: dict[str, Any]) -> str:
 
     :param outcome: See :func:`benchmark`
     """
-    lines = [f"{'agent steps / s':<40}{'median':>9}{'min':>9}{'max':>9}  threads"]
+    sides = "ours all worlds in one set of arrays, the peers one world after the other"
+    if outcome["same_environment"]:
+        sides = "the same on all sides, one world after the other"
+    clock = {"wall": "s", "cpu": "CPU second"}[outcome["settings"]["clock"]]
+    lines = [
+        f"environment: {outcome['settings']['env']}, {sides}",
+        f"{f'agent steps / {clock}':<40}{'median':>9}{'min':>9}{'max':>9}  threads",
+    ]
     for each in outcome["results"]:
         numbers = "".join(f"{each[key]:>9,.0f}" for key in ("steps_per_second", "min", "max"))
         lines.append(f"{each['name']:<40}{numbers}{each['threads']:>9}")
@@ -280,7 +319,11 @@ def table(outcome: dict[str, Any]) -> str:
 
 def make_parser() -> ConsoleParser:
     """The flags of the benchmark."""
-    parser = ConsoleParser(prog="sb3-e2c speed", description=__doc__)
+    parser = ConsoleParser(
+        prog="sb3-e2c speed",
+        description=__doc__,
+        examples=["sb3-e2c speed --policy gru --worlds 8 --threads 1 2 --json speed.json"],
+    )
     add = parser.add_argument
     add("--env", default="simple_spread", help=f"{', '.join(TASKS)} (default: simple_spread)")
     add("--policy", choices=("mlp", "gru"), default="mlp", help="networks (default: mlp)")
@@ -294,6 +337,26 @@ def make_parser() -> ConsoleParser:
         nargs="+",
         default=[1, 2],
         help="torch threads to try; each contender is judged by its best (default: 1 2)",
+    )
+    add(
+        "--clock",
+        choices=tuple(_CLOCKS),
+        default="wall",
+        help="cpu: seconds that the processor worked for us, on a busy machine (default: wall)",
+    )
+    add(
+        "--same-environment",
+        action="store_true",
+        help="ours, too, steps one world after the other through SuperSuit",
+    )
+    add(
+        "--peer",
+        action="append",
+        default=[],
+        metavar="NAME[=PATH]",
+        help="one more library, besides SB3 and sb3-contrib; may be repeated. "
+        f"{', '.join(INSTALLED)} (if installed, always), or with the path of a checkout: "
+        f"{', '.join(REPOSITORIES)}",
     )
     add("--json", type=Path, metavar="FILE", help="write the results to FILE")
     return parser

@@ -1,6 +1,6 @@
 """Train a team: ``python -m sb3_e2c.zoo.train --algo e2c_t --env MultiRover-6-3-v0``.
 
-RL-Zoo's ``train`` with our algorithms, environments and manager, one more flag (``--preset``), and
+RL-Zoo's ``train`` with our algorithms, environments and manager, ``--preset`` and ``--resume``, and
 mistakes reported in one line before anything is written. All steps are agent steps; ``n_envs`` in
 the hyperparameters counts worlds.
 """
@@ -42,6 +42,7 @@ from sb3_e2c.zoo.resume import (
     resumed_arguments,
     stop_signals,
 )
+from sb3_e2c.zoo.study import trial_arguments
 
 _PAIRS = {"action": StoreDict, "metavar": "KEY:VALUE"}
 # RL-Zoo's flags that mean something else here, or read their values as data instead of code
@@ -70,14 +71,21 @@ _CHANGED_FLAGS: dict[str, dict[str, Any]] = {
     },
     "--env-kwargs": _PAIRS,
     "--eval-env-kwargs": _PAIRS,
+    "--trial-id": {
+        "type": str,
+        "metavar": "TRIAL|best",
+        "help": "Train with the hyperparameters of a trial of sb3-e2c tune",
+    },
+    "--study-name": {"help": "The study of --trial-id (default: ALGO_ENV)"},
+    "--storage": {"help": "Where that study is stored (default: its journal in the log folder)"},
 }
-# RL-Zoo's search for hyperparameters and its replay buffers are not for teams.
-_NOT_FOR_TEAMS = {
-    *("--n-trials", "--max-total-trials", "--sampler", "--pruner", "--storage", "--study-name"),
-    *("--trial-id", "--n-jobs", "--n-startup-trials", "--n-evaluations", "--no-optim-plots"),
+# RL-Zoo's search for hyperparameters is a command of its own here.
+_OF_TUNE = {
+    *("--n-trials", "--max-total-trials", "--sampler", "--pruner", "--n-jobs"),
+    *("--n-startup-trials", "--n-evaluations", "--no-optim-plots"),
     *("--optimization-log-path", "--optimize-hyperparameters"),
-    *("--save-replay-buffer", "--truncate-last-trajectory"),
 }
+_NOT_FOR_TEAMS = {*_OF_TUNE, "--save-replay-buffer", "--truncate-last-trajectory"}
 _AT_LEAST = {
     "eval_episodes": 1,
     "n_eval_envs": 1,
@@ -93,7 +101,17 @@ class TrainParser(ConsoleParser):
     """
 
     def __init__(self, argv: Sequence[str]):
-        super().__init__(prog="sb3-e2c train", description=__doc__, formatter_class=_Raw)
+        super().__init__(
+            prog="sb3-e2c train",
+            description=__doc__,
+            examples=[
+                "sb3-e2c train --algo e2c_t --env MultiRover-6-3-v0 --seed 1 -f logs -P",
+                "sb3-e2c train --algo e2c --env PredatorPrey-v0 --preset gru,lambda_1 -tb tb",
+                "sb3-e2c train --env MultiRover-8-4-v0 -params n_epochs:4 oem_kwargs.psi:0.1",
+                "sb3-e2c train --resume logs/e2c_t/MultiRover-6-3-v0_1",
+                "sb3-e2c train --env KeepAway-v0 --trial-id best  # after sb3-e2c tune",
+            ],
+        )
         self.argv = argv
 
     def add_argument(self, *names: str, **kwargs: Any) -> Any:
@@ -145,6 +163,8 @@ class TrainParser(ConsoleParser):
             if "resume" in given:
                 flags = {each.dest: each.option_strings[-1] for each in self._actions}
                 args = resumed_arguments(Path(args.resume), given, defaults, flags)
+            elif given.keys() & {"trial_id", "study_name", "storage"}:
+                args = trial_arguments(given, defaults)
             _check(args)
         return args
 
@@ -155,11 +175,9 @@ class _Refuse(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Report the flag as a mistake."""
         flags = "/".join(self.option_strings)
-        parser.error(f"{flags} is not available for teams: no search, no replay buffer")
-
-
-class _Raw(argparse.RawDescriptionHelpFormatter):
-    """Keeps the paragraphs of the description."""
+        searches = _OF_TUNE.intersection(self.option_strings)
+        why = "search with sb3-e2c tune" if searches else "they have no replay buffer"
+        parser.error(f"{flags} is not available for teams: {why}")
 
 
 def _check(args: argparse.Namespace) -> None:
