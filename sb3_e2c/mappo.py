@@ -345,6 +345,7 @@ class MAPPO(PPO):
             actions, clipped_actions = self.act()
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             assert isinstance(new_obs, np.ndarray)
+            self.check(new_obs, rewards, infos)
             rewards = self.reward_scale * rewards
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -408,6 +409,18 @@ class MAPPO(PPO):
         actions, states = self._sample_actions(self._last_obs, states)
         self._memory = self._memory._replace(actor=states.view_as(self._memory.actor))
         return actions, self._clip_actions(actions)
+
+    def check(
+        self, new_obs: np.ndarray, rewards: np.ndarray, infos: Sequence[dict[str, Any]]
+    ) -> None:
+        """Stop if an environment returned numbers that are not finite.
+
+        :param new_obs: Shape (S, D)
+        :param rewards: Shape (S,)
+        :param infos: One dict for each slot
+        """
+        assert self._recorder is not None, "start_episodes() makes the recorder"
+        self._recorder.check(self.rollout_buffer.pos, new_obs, rewards, infos)
 
     def record(
         self,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_e2c.buffers import TeamRolloutBuffer, Timeout
+from sb3_e2c.checks import as_type, check_costs, check_finite
 from sb3_e2c.constraints import check_n_costs, n_parties, party_costs, read_costs
 
 Infos = Sequence[dict[str, Any]]
@@ -55,8 +56,20 @@ class TeamRecorder:
         """
         parties = n_parties(self.cost_scope, self.n_agents)
         self.episode_costs = np.zeros((self.n_worlds, parties, self.n_constraints))
-        self.critic_states = self._critic_states(reset_infos)
-        self._check_finite(0, observation=observations)
+        self.critic_states = self._critic_states(reset_infos, "after a reset")
+        check_finite(self.agents, "after a reset", observation=observations)
+
+    def check(self, step: int, new_obs: np.ndarray, rewards: np.ndarray, infos: Infos) -> None:
+        """Stop before numbers that are not finite reach callbacks, which may replace rewards.
+
+        :param step: Of this rollout, from 0
+        :param new_obs: Shape (S, D)
+        :param rewards: Of the environment, shape (S,)
+        :param infos: One dict for each slot; costs without limits are checked here
+        """
+        check_finite(self.agents, _at(step), observation=new_obs, reward=rewards)
+        if not self.n_constraints:
+            check_costs(self.agents, _at(step), read_costs(infos, self.agents), limited=False)
 
     def record(
         self,
@@ -83,11 +96,11 @@ class TeamRecorder:
         :param reset_infos: One dict for each slot, new where an episode ended
         """
         ended = dones[:: self.n_agents]
-        agent_costs = self._agent_costs(infos)
-        slot_costs = agent_costs.reshape(len(infos), self.n_constraints)
-        self._check_finite(buffer.pos, observation=new_obs, reward=rewards, cost=slot_costs)
+        when = _at(buffer.pos)
+        check_finite(self.agents, when, observation=new_obs, reward=rewards)
+        agent_costs = self._agent_costs(infos, when)
         costs = party_costs(agent_costs, self.cost_scope, self.team_cost)
-        critic_states = self._critic_states(infos)
+        critic_states = self._critic_states(infos, when)
         timeout = self._timeout(buffer.pos, ended, infos, critic_states)
         step = (last_obs, actions, rewards, episode_starts, costs, self.critic_states)
         buffer.add(*step, ended, timeout)
@@ -95,18 +108,19 @@ class TeamRecorder:
         if ended.any():
             self.finished_costs.extend(self.episode_costs[ended])
             self.episode_costs[ended] = 0.0
-            critic_states[ended] = self._critic_states(reset_infos)[ended]
+            critic_states[ended] = self._critic_states(reset_infos, when)[ended]
         self.critic_states = critic_states
 
-    def _agent_costs(self, infos: Infos) -> np.ndarray:
+    def _agent_costs(self, infos: Infos, when: str) -> np.ndarray:
         """Constrained costs of every agent, shape (W, N, M)."""
         if not self.n_constraints:
             return np.zeros((self.n_worlds, self.n_agents, 0))
         costs = read_costs(infos, self.agents)
         check_n_costs(costs, self.n_constraints, self.agents)
+        check_costs(self.agents, when, costs, limited=True)
         return costs
 
-    def _critic_states(self, infos: Infos) -> np.ndarray:
+    def _critic_states(self, infos: Infos, when: str) -> np.ndarray:
         """Extra state of the critics, shape (W, G)."""
         if not self.critic_state_dim:
             return np.zeros((self.n_worlds, 0), np.float32)
@@ -115,11 +129,15 @@ class TeamRecorder:
             if np.shape(state) != (self.critic_state_dim,):
                 raise ValueError(
                     f"info['critic_state'] of world {world} has the shape {np.shape(state)}; "
-                    f"expected ({self.critic_state_dim},), at every reset and every step"
+                    f"expected ({self.critic_state_dim},), at every reset and every step. "
+                    f"This was {when}"
                 )
-        states = np.array(found, np.float32)
-        slots = np.repeat(states, self.n_agents, axis=0)
-        self._check_finite(None, critic_state=slots)
+        states = as_type(np.array(found), np.float32)
+        if states is None:
+            raise ValueError(
+                f"info['critic_state'] is {found[0]!r} in world 0 {when}; expected numbers"
+            )
+        check_finite(self.agents[:1], when, critic_state=states)
         return states
 
     def _timeout(
@@ -135,32 +153,13 @@ class TeamRecorder:
         worlds = np.array(cut_off)
         last = [[i["terminal_observation"] for i in self._team(infos, w)] for w in cut_off]
         observations = np.concatenate([np.array(team) for team in last])
-        self._check_finite(step, worlds, terminal_observation=observations)
+        check_finite(self.agents, _at(step), worlds, terminal_observation=observations)
         return Timeout(step, worlds, observations, critic_states[worlds])
 
     def _team(self, infos: Infos, world: int) -> Infos:
         """Infos of the agents of a world."""
         return infos[world * self.n_agents : (world + 1) * self.n_agents]
 
-    def _check_finite(
-        self, n_steps: int | None, worlds: np.ndarray | None = None, **quantities: np.ndarray
-    ) -> None:
-        """Stop before a number that is not finite reaches the networks.
 
-        :param n_steps: Steps of this rollout so far, if known
-        :param worlds: Numbers of the w worlds that the arrays are about; None: all
-        :param quantities: Arrays by name, shape (w·N, ...)
-        """
-        for name, array in quantities.items():
-            finite = np.isfinite(array)
-            if finite.all():
-                continue
-            first = int(np.argwhere(~finite)[0, 0])
-            row, agent = divmod(first, self.n_agents)
-            world = row if worlds is None else worlds[row]
-            when = "" if n_steps is None else f" at step {n_steps} of the rollout"
-            raise ValueError(
-                f"{name} of world {world}, agent {self.agents[agent]!r} is not finite{when}: "
-                f"{array[first]}. Training stops, the model keeps its last parameters; mend the "
-                "environment, or bound this quantity"
-            )
+def _at(step: int) -> str:
+    return f"at step {step} of the rollout"

@@ -8,7 +8,7 @@ agents act on that side and slot = world·n + agent.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -231,7 +231,7 @@ class PaddedWorld(World):
         return row[: space.shape[0]] if isinstance(space, spaces.Box) and space.shape else row
 
     @override
-    def _observations(self, observations: dict[str, Any]) -> dict[str, Any]:
+    def _observations(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         native = super()._observations(observations)
         if not isinstance(self._space, spaces.Box):
             return native

@@ -1,6 +1,6 @@
 """One world as SuperSuit needs it, and what an environment must be like to become one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +9,8 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from typing_extensions import override
+
+from sb3_e2c.checks import check_answer, described, fitting, named_world, number
 
 MakeEnv = Callable[[], ParallelEnv]
 
@@ -35,6 +37,7 @@ class World(BaseParallelWrapper):
         robot = getattr(env.unwrapped, "single_agent_env", None)
         self.render_mode = getattr(env, "render_mode", None) or getattr(robot, "render_mode", None)
         self._space, self._action_space = self._common_spaces()
+        self._own_spaces = {a: as_float32(env.observation_space(a)) for a in self.agents}
 
     def _order(self, agents: list[str]) -> list[str]:
         """The order of the rows."""
@@ -67,45 +70,94 @@ class World(BaseParallelWrapper):
         if options is not None:
             seed, own = options["seeds"][self.index], options["options"][self.index]
             options = own or None
-        observations, infos = self.env.reset(seed=seed, options=options)
-        self._check_agents("reset", observations)
-        own_infos = {a: {RESET_INFO: dict(infos.get(a, {}))} for a in self.agents}
+        with named_world("reset", self.index):
+            answer = self.env.reset(seed=seed, options=options)
+        observations, infos = check_answer("reset", answer, self.index)
+        self._check_agents("reset", observations=observations)
+        own_infos = {a: {RESET_INFO: self._own_info(infos, a)} for a in self.agents}
         return self._observations(observations), own_infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """Step, and refuse what does not fit one row for each agent."""
-        observations, rewards, terminated, truncated, infos = self.env.step(actions)
-        self._check_agents("step", observations, rewards, terminated, truncated)
+        with named_world("step", self.index):
+            answer = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = check_answer(
+            "step", answer, self.index
+        )
+        self._check_agents(
+            "step",
+            observations=observations,
+            rewards=rewards,
+            terminations=terminated,
+            truncations=truncated,
+        )
+        terminated = self._ends("termination", terminated)
+        truncated = self._ends("truncation", truncated)
         self._check_end(terminated, truncated)
         return (
             self._observations(observations),
-            {agent: rewards[agent] for agent in self.agents},
-            {agent: bool(terminated[agent]) for agent in self.agents},
-            {agent: bool(truncated[agent]) for agent in self.agents},
+            {agent: self._reward(agent, rewards[agent]) for agent in self.agents},
+            terminated,
+            truncated,
             {agent: self._own_info(infos, agent) for agent in self.agents},
         )
 
-    def _observations(self, observations: dict[str, Any]) -> dict[str, Any]:
-        if not isinstance(self._space, spaces.Box):
-            return {agent: observations[agent] for agent in self.agents}
-        dtype = self._space.dtype
-        return {agent: np.array(observations[agent], dtype=dtype) for agent in self.agents}
+    def _observations(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {agent: self._observation(agent, observations[agent]) for agent in self.agents}
 
-    def _own_info(self, infos: dict[str, Any], agent: str) -> dict[str, Any]:
-        info = dict(infos.get(agent, {}))
+    def _observation(self, agent: str, found: Any) -> Any:
+        """An agent's observation in its space's type, as a copy if it is an array."""
+        space = self._own_spaces[agent]
+        observation = fitting(found, space)
+        if observation is None:
+            raise ValueError(
+                f"the observation of world {self.index}, agent {agent!r} is {described(found)}; "
+                f"expected one of its space {space}. Mend the environment or observation_space()"
+            )
+        return observation
+
+    def _reward(self, agent: str, found: Any) -> np.float32:
+        reward = number(found)
+        if reward is None:
+            raise ValueError(
+                f"the reward of world {self.index}, agent {agent!r} is {described(found)}; "
+                "expected one number for each agent"
+            )
+        with np.errstate(over="ignore"):  # too large ones become infinite, which learners refuse
+            return np.float32(reward)
+
+    def _ends(self, kind: str, answers: Mapping[str, Any]) -> dict[str, bool]:
+        for agent in self.agents:
+            if number(answers[agent]) not in (0, 1):
+                raise ValueError(
+                    f"the {kind} of world {self.index}, agent {agent!r} is "
+                    f"{described(answers[agent])}; expected True or False"
+                )
+        return {agent: bool(answers[agent]) for agent in self.agents}
+
+    def _own_info(self, infos: Mapping[str, Any], agent: str) -> dict[str, Any]:
+        found = infos.get(agent, {})
+        if not isinstance(found, Mapping):
+            raise ValueError(
+                f"the info of world {self.index}, agent {agent!r} is {described(found)}; expected "
+                "a dict, or none of this agent"
+            )
+        info = dict(found)
         info.pop("TimeLimit.truncated", None)  # patched wrappers set it; the VecEnv decides it
         return info
 
-    def _check_agents(self, call: str, *answers: dict[str, Any]) -> None:
-        missing = sorted({a for answer in answers for a in self.agents if a not in answer})
+    def _check_agents(self, call: str, **answers: Mapping[str, Any]) -> None:
+        missing = {a: None for answer in answers.values() for a in self.agents if a not in answer}
         if missing:
+            kinds = [kind for kind, answer in answers.items() if not set(missing) <= set(answer)]
             raise ValueError(
-                f"{call}() of world {self.index} returned nothing for the agents {missing}; "
-                f"expected all of {self.agents}, because each has a slot of its own until all end "
-                "together. Keep ended agents in the environment (zero reward, any observation)"
+                f"{call}() of world {self.index} returned {' and '.join(kinds)} with nothing for "
+                f"the agents {list(missing)}; expected all of {self.agents}, because each has a "
+                "slot of its own until all end together. Keep ended agents in the environment "
+                "(zero reward, any observation)"
             )
 
-    def _check_end(self, terminated: dict[str, Any], truncated: dict[str, Any]) -> None:
+    def _check_end(self, terminated: Mapping[str, bool], truncated: Mapping[str, bool]) -> None:
         ended = [agent for agent in self.agents if terminated[agent] or truncated[agent]]
         if 0 < len(ended) < len(self.agents):
             others = [agent for agent in self.agents if agent not in ended]

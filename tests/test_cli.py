@@ -30,7 +30,7 @@ def error_of(capsys, *argv):
     with pytest.raises(SystemExit) as exit_:
         cli.main(list(argv))
     assert exit_.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = capsys.readouterr().err.splitlines(keepends=True)
     return line
 
 
@@ -74,12 +74,13 @@ def test_no_command_shows_the_help(capsys):
 @pytest.mark.parametrize(
     ("argv", "nearest"),
     [
-        (["enjoy", "--algoo", "e2c"], "unknown flag '--algoo'; did you mean '--algo'?"),
-        (["enjoy", "--algoo=e2c"], "unknown flag '--algoo'; did you mean '--algo'?"),
-        (["train", "--n-timestep5", "8"], "'--n-timestep5'; did you mean '--n-timesteps'?"),
-        (["push", "--repo_id", "me/team"], "'--repo_id'; did you mean '--repo-id'?"),
-        (["load", "--repo-id", "me/team", "--revison", "a"], "did you mean '--revision'?"),
-        (["enjoy", "extra"], "unrecognized arguments: extra"),
+        (["enjoy", "--algoo", "e2c"], "arguments: --algoo e2c; did you mean --algo?"),
+        (["enjoy", "--algoo=e2c"], "arguments: --algoo=e2c; did you mean --algo?"),
+        (["train", "--n-timestep5", "8"], "did you mean --n-timesteps?"),
+        (["push", "--repo_id", "me/team"], "did you mean --repo-id?"),
+        (["load", "--repo-id", "me/team", "--revison", "a"], "did you mean --revision?"),
+        (["enjoy", "extra"], "unrecognized arguments: extra\n"),
+        (["enjoy", "--zzz"], "unrecognized arguments: --zzz\n"),
         (["train", "--preset", "pur"], "unknown preset (--preset) 'pur'; did you mean 'pure'?"),
         (["benchmark", "--suite", "smok"], "did you mean 'smoke'?"),
         (["pusk"], "unknown command 'pusk'; did you mean 'push'?"),

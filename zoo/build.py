@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.vec_env import MultiAgentVecEnv, OpponentVecEnv
+from sb3_e2c.zoo.archives import check_archive
 from sb3_e2c.zoo.configuration import ALGORITHMS, ZOO_KEYS
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.parts import CLASSES, class_named
@@ -133,7 +134,9 @@ def load_weights(model: MAPPO, path: str | Path) -> None:
     :raises UserError: if the file is broken, or belongs to another kind of model
     """
     try:
+        check_archive(path, _largest_file(model))
         _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
+        _check_compact(weights)
     except pickle.UnpicklingError as error:  # torch's advice would be to execute it
         raise UserError(
             f"{path} is no readable model: it holds something else than numbers, or is damaged"
@@ -147,6 +150,26 @@ def load_weights(model: MAPPO, path: str | Path) -> None:
             f"{path} does not fit; was it trained with another algorithm or environment? "
             f"{brief(error)}"
         ) from error
+
+
+def _largest_file(model: MAPPO) -> int:
+    """Most bytes that a file with the weights and the optimizer's moments of a model may have."""
+    weights = [*model.policy.state_dict().values(), model.multipliers.values]
+    return 2**24 + 8 * sum(tensor.numel() * tensor.element_size() for tensor in weights)
+
+
+def _check_compact(tree: Any) -> None:
+    """Refuse arrays that repeat a few numbers without end: a copy of one would need any memory."""
+    waiting, seen = [tree], set()  # what a file holds may refer to itself
+    while waiting:
+        found = waiting.pop()
+        if isinstance(found, th.Tensor):
+            held = found.untyped_storage().nbytes() if found.layout == th.strided else -1
+            if found.numel() * found.element_size() > held:
+                raise ValueError("it has arrays that claim more numbers than they hold")
+        elif isinstance(found, Mapping | list | tuple | set) and id(found) not in seen:
+            seen.add(id(found))
+            waiting += found.values() if isinstance(found, Mapping) else found
 
 
 def load_opponent(model: MAPPO, env: OpponentVecEnv, path: str | Path) -> MAPPO:

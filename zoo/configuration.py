@@ -17,7 +17,7 @@ import yaml
 
 from sb3_e2c import E2CMAPPO, MAPPO
 from sb3_e2c.envs import ENV_IDS
-from sb3_e2c.zoo.console import UserError, unknown
+from sb3_e2c.zoo.console import UserError, brief, unknown
 from sb3_e2c.zoo.parts import CLASSES, PARTS, class_named
 from sb3_e2c.zoo.signatures import Argument, arguments_of, numbers_in
 
@@ -53,8 +53,21 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 }
 
 
+# A file may come from a stranger: a few lines of YAML can stand for gigabytes.
+_LARGEST, _MOST_ALIASES, _DEEPEST = 2**18, 16, 20
+
+
 class _Loader(yaml.SafeLoader):
     """Safe YAML in which 3e-4 is a number; YAML 1.1 takes it for a string."""
+
+    n_aliases = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Read a node, unless it is one alias too many."""
+        self.n_aliases += self.check_event(yaml.AliasEvent)
+        if self.n_aliases > _MOST_ALIASES:
+            raise yaml.YAMLError(f"it has more than {_MOST_ALIASES} aliases; write the values out")
+        return super().compose_node(parent, index)
 
 
 _Loader.add_implicit_resolver(
@@ -69,12 +82,25 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     :raises UserError: if there is no such file, or something else in it
     """
     try:
-        content = yaml.load(Path(path).read_text(), Loader=_Loader)  # a SafeLoader
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"cannot read {path}: {error}") from None
+        with open(path, "rb") as file:
+            text = file.read(_LARGEST + 1)
+        content = None if len(text) > _LARGEST else yaml.load(text, Loader=_Loader)  # a SafeLoader
+    except Exception as error:  # PyYAML lets out what int(), date() and others raise
+        raise UserError(f"cannot read {path}: {brief(error)}") from None
+    if len(text) > _LARGEST:
+        raise UserError(f"{path} has more than {_LARGEST:,} bytes, expected a few lines of YAML")
     if not isinstance(content, dict):
         raise UserError(f"{path} holds {type(content).__name__}, expected a YAML mapping")
+    if _is_deeper(content, _DEEPEST):
+        raise UserError(f"{path} has more than {_DEEPEST} levels, expected plain YAML")
     return content
+
+
+def _is_deeper(value: Any, levels: int) -> bool:
+    inner = value.values() if isinstance(value, dict) else value
+    if not isinstance(value, (dict, list, tuple, set)):
+        return False
+    return levels == 0 or any(_is_deeper(each, levels - 1) for each in inner)
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,9 @@ class ConsoleParser(argparse.ArgumentParser):
         """See :func:`fail`; an unknown flag gets the nearest one beside it."""
         stranger = re.match(r"unrecognized arguments: (-[^\s=]+)", message)
         if stranger:
-            fail(unknown("flag", stranger[1], self._option_string_actions))
+            flags = self._option_string_actions
+            close = difflib.get_close_matches(stranger[1], flags, n=1, cutoff=0.75)
+            message += f"; did you mean {close[0]}?" if close else ""
         fail(message)
 
 

@@ -406,7 +406,7 @@ def _training_steps(model_path: Path) -> int:
     try:
         with zipfile.ZipFile(model_path) as archive:
             return int(json.loads(archive.read("data"))["num_timesteps"])
-    except (KeyError, ValueError, TypeError) as error:
+    except Exception as error:  # whatever zip files and JSON from a stranger raise
         raise UserError(f"{model_path} does not say how many steps it learned from") from error
 
 

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_e2c.zoo.console import UserError, write_whole
+from sb3_e2c.zoo.archives import check_archive
+from sb3_e2c.zoo.console import UserError, brief, write_whole
 
 _SETTINGS = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon")
 _MOMENTS = ("mean", "var", "count")
+_LARGEST = 2**26  # bytes, of a million observed numbers
 
 
 def statistics_path(model_path: str | Path) -> Path:
@@ -43,8 +45,9 @@ def load_statistics(env: VecEnv, path: str | Path) -> VecNormalize:
     :raises UserError: if the file is missing, broken, or belongs to other observations
     """
     try:
+        check_archive(path, _LARGEST)
         with np.load(path, allow_pickle=False) as file:
-            numbers = dict(file)
+            numbers = {name: _plain(name, file[name]) for name in file.files}
         wrapped = VecNormalize(env, **{name: numbers[name].item() for name in _SETTINGS})
         for rms in ("obs_rms", "ret_rms"):
             for moment in _MOMENTS if hasattr(wrapped, rms) else ():
@@ -52,6 +55,12 @@ def load_statistics(env: VecEnv, path: str | Path) -> VecNormalize:
                 setattr(getattr(wrapped, rms), moment, numbers[f"{rms}.{moment}"])
                 if np.shape(current) != numbers[f"{rms}.{moment}"].shape:
                     raise ValueError(f"{rms} has another shape than the environment's")
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise UserError(f"cannot read the observation statistics {path}: {error}") from error
+    except Exception as error:  # whatever numpy raises for broken content
+        raise UserError(f"cannot read the observation statistics {path}: {brief(error)}") from error
     return wrapped
+
+
+def _plain(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "biuf" or np.isnan(array).any():
+        raise ValueError(f"{name} holds something else than numbers")
+    return array

@@ -129,7 +129,7 @@ def make_env(
     if run.config.get("normalize"):
         plain, pickled = statistics_path(run.model_path), run.folder / run.env_id
         if trust and not plain.exists():
-            env = VecNormalize.load(str(pickled / "vecnormalize.pkl"), env)
+            env = _unpickle_statistics(pickled / "vecnormalize.pkl", env)
         else:
             env = load_statistics(env, plain)
         env.training = env.norm_reward = False
@@ -199,6 +199,13 @@ def _adversary_file(run: Run, opponent: str) -> Path:
             "name a file like PredatorPrey-v0.adversary.zip, or say --opponent random"
         )
     return path
+
+
+def _unpickle_statistics(path: Path, env: VecEnv) -> VecNormalize:
+    try:
+        return VecNormalize.load(str(path), env)
+    except Exception as error:  # whatever a broken or foreign pickle may raise
+        raise UserError(f"cannot load {path}: {brief(error)}") from error
 
 
 def _unpickle(run: Run, env: VecEnv, **flags: Any) -> MAPPO:
