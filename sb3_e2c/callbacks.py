@@ -85,7 +85,9 @@ class OEMRewardCallback(BaseCallback):
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], np.asarray(self.locals["dones"], dtype=bool)
         rewards = _editable_rewards(self.locals)
-        bonuses = _relevance(infos) * self.estimator.score(self._observations(infos, dones))
+        observations = self._observations(infos, dones)
+        bonuses = _relevance(infos) * self.estimator.score(observations)
+        _check_bonuses(bonuses, observations, type(self.estimator).__name__)
         # A hidden channel: the algorithm goes on to learn from this very array, so it must be
         # edited in place; a new array in its locals would go unnoticed.
         if self.psi is None:
@@ -164,6 +166,24 @@ def _relevance(infos: Sequence[dict[str, Any]]) -> np.ndarray:
     :return: shape (S,)
     """
     return np.array([info.get("beta") or 1.0 for info in infos], dtype=np.float64)
+
+
+def _check_bonuses(bonuses: np.ndarray, observations: np.ndarray, estimator: str) -> None:
+    """Stop before a bonus that is not finite is learned from.
+
+    :param bonuses: shape (S,)
+    :param observations: what was scored, shape (S, D)
+    :param estimator: its name
+    """
+    odd = np.flatnonzero(~np.isfinite(bonuses))
+    if len(odd) > 0:
+        scored = observations[odd[0]]
+        raise ValueError(
+            f"The {estimator} bonus of slot {odd[0]} is {bonuses[odd[0]]}, for an observation with "
+            f"numbers from {scored.min():g} to {scored.max():g}: scale what is scored to ordinary "
+            'numbers, for example with VecNormalize or infos["novelty_observation"], and give a '
+            "finite beta."
+        )
 
 
 def _from_infos(key: str, infos: Sequence[dict[str, Any]], slots: Any) -> list[Any]:

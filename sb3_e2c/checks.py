@@ -6,7 +6,7 @@ S = W·N slots, slot = world·N + agent, M costs.
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -179,3 +179,94 @@ def _in_box(found: Any, space: spaces.Box) -> np.ndarray | None:
         return None
     typed = as_type(array, space.dtype) if array.shape == space.shape else None
     return typed.copy() if typed is array else typed
+
+
+class Form(NamedTuple):
+    """What the arrays of a simulator must be like."""
+
+    n_worlds: int
+    n_agents: int
+    space: spaces.Space  # of an agent's observations
+
+    def observations(self, call: str, found: Any, n_worlds: int) -> np.ndarray:
+        """Observations in the type of their space, shape (R, N, ...).
+
+        :param call: "reset" or "step"
+        :param found: what it returned
+        :param n_worlds: R
+        """
+        shape = (n_worlds, self.n_agents, *(self.space.shape or ()))
+        array = check_array(call, "observations", found, shape)
+        typed = as_type(array, self.space.dtype)
+        if typed is None:
+            raise ValueError(
+                f"{call}() of the simulator returned observations of type {array.dtype}; expected "
+                f"numbers that {self.space.dtype}, the type of their space, can hold"
+            )
+        return typed
+
+
+def check_parts(call: str, answer: Any, n_parts: int) -> tuple[Any, ...]:
+    """Refuse an answer of another simulator's kind.
+
+    :param call: "reset" or "step"
+    :param answer: what it returned
+    :param n_parts: how many parts it must have
+    """
+    if not isinstance(answer, tuple) or len(answer) != n_parts:
+        found = f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__
+        raise ValueError(f"{call}() of the simulator returned {found}; expected {n_parts} parts")
+    return answer
+
+
+def check_simulator(sim: Any, n_worlds: int, agents: Sequence[str]) -> Any:
+    """Refuse a simulator of other worlds than were asked for.
+
+    :param sim: has W worlds
+    :param n_worlds: how many it must have
+    :param agents: names of the agents that it must have
+    :return: the simulator
+    """
+    groups = getattr(sim, "groups", None)
+    found = list(sim.possible_agents) if groups is None else [a for g in groups.values() for a in g]
+    if sim.n_worlds != n_worlds or sorted(found) != sorted(agents):
+        raise ValueError(
+            f"the simulator {type(sim).__name__} has {sim.n_worlds} worlds of {found}; expected "
+            f"{n_worlds} of {list(agents)}, as its environment was asked for"
+        )
+    return sim
+
+
+def check_fresh(observations: Any, last: np.ndarray | None) -> Any:
+    """Refuse a simulator that writes into the array that it has returned before.
+
+    :param observations: of this step
+    :param last: of the step before
+    :return: the observations
+    """
+    same = isinstance(observations, np.ndarray) and last is not None
+    if same and np.may_share_memory(observations, last):
+        raise ValueError(
+            "step() of the simulator returned the array of the step before again; expected a new "
+            "one at every step, because learners keep them: return observations.copy()"
+        )
+    return observations
+
+
+def check_array(call: str, name: str, found: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Refuse what is no array of a shape.
+
+    :param call: "reset" or "step"
+    :param name: what it is
+    :param found: what was returned as it
+    :param shape: what it must have, (W, N, ...)
+    :return: the array
+    """
+    if isinstance(found, np.ndarray) and found.shape == shape:
+        return found
+    is_array = isinstance(found, np.ndarray)
+    kind = f"shape {found.shape}" if is_array else f"type {type(found).__name__}"
+    raise ValueError(
+        f"{call}() of the simulator returned {name} of {kind}; expected an array of shape {shape}: "
+        "worlds, then agents"
+    )

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import (
     sync_envs_normalization,
 )
 
+from sb3_e2c.checks import check_costs, check_finite
 from sb3_e2c.constraints import parse_cost_limits, read_costs, team_costs
 from sb3_e2c.monitor import (
     TeamMonitor,
@@ -118,6 +119,7 @@ def evaluate_team(
     """
     tally = _Tally(env, n_episodes)
     observations, states = env.reset(), None
+    tally.check(observations)
     episode_starts = np.ones(env.num_envs, dtype=bool)
     while tally.wanted.any():
         actions, states = model.predict(
@@ -133,6 +135,7 @@ def evaluate_team(
                 info, done = infos[slot], bool(episode_starts[slot])
                 callback(locals() | {"info": info, "done": done}, globals())
         tally.add(rewards, episode_starts, infos)
+        tally.check(observations)
         if render:
             env.render()
     return tally.results()
@@ -146,6 +149,7 @@ class _Tally:
             raise ValueError(f"n_episodes is {n_episodes}; expected at least 1 world episode")
         self.env, self.team = env, unwrap_team(env, "evaluate_team")
         n_worlds, n_agents = self.team.n_worlds, self.team.n_agents
+        self.n_steps = 0
         self._missing = (n_episodes + np.arange(n_worlds)) // n_worlds
         self._returns, self._agent_returns = np.zeros(n_worlds), np.zeros((n_worlds, n_agents))
         self._lengths = np.zeros(n_worlds, dtype=np.int64)
@@ -158,6 +162,18 @@ class _Tally:
         """Worlds with episodes still to count, shape (W,)."""
         return self._missing > 0
 
+    @property
+    def _when(self) -> str:
+        return f"at step {self.n_steps} of the evaluation"
+
+    def check(self, observations: Any) -> None:
+        """Stop before a policy is asked about observations that are not finite.
+
+        :param observations: shape (S, ...); dictionaries of them are left to the policy
+        """
+        if isinstance(observations, np.ndarray):
+            check_finite(self.team.agents, self._when, observation=observations)
+
     def add(self, rewards: np.ndarray, dones: np.ndarray, infos: Sequence[dict[str, Any]]) -> None:
         """Count a step of all worlds.
 
@@ -167,6 +183,9 @@ class _Tally:
         """
         rewards = raw_rewards(self.env, rewards)
         costs = read_costs(infos, self.team.agents)
+        self.n_steps += 1
+        check_finite(self.team.agents, self._when, reward=rewards)
+        check_costs(self.team.agents, self._when, costs, limited=False)
         self._returns += team_rewards(rewards, self.team)
         self._agent_returns += rewards.reshape(self._agent_returns.shape)
         self._costs = add_costs(self._costs, team_costs(costs, self.team.team_cost))

@@ -29,7 +29,11 @@ def normalize(advantages: th.Tensor) -> th.Tensor:
     """
     if advantages.numel() == 1:
         return advantages
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    spread = advantages.std()
+    if not th.isfinite(spread):  # their squares are beyond float32
+        advantages = advantages / advantages.abs().max()
+        spread = advantages.std()
+    return (advantages - advantages.mean()) / (spread + 1e-8)
 
 
 def policy_loss(ratio: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:

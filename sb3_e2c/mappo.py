@@ -15,6 +15,7 @@ import pathlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any, ClassVar
 
 import numpy as np
@@ -509,6 +510,7 @@ class MAPPO(PPO):
                 break
             if self.stop_epochs is not None and self.stop_epochs():
                 break
+        self._check_learned()
         self._log_training(logs)
 
     def _train_opponent(self) -> None:
@@ -572,10 +574,7 @@ class MAPPO(PPO):
 
     def _gradient_step(self, loss: th.Tensor) -> None:
         if not th.isfinite(loss):
-            raise ValueError(
-                f"the loss is {loss.item()} after {self.num_timesteps} agent steps; training "
-                f"stops, the model keeps its last finite parameters. {_ADVICE}"
-            )
+            raise self._divergence(f"the loss is {loss.item()}")
         for parameters in self.policy.clipped_together:
             for parameter in parameters:
                 parameter.grad = None  # as optimizer.zero_grad() does, ten times faster
@@ -583,8 +582,26 @@ class MAPPO(PPO):
         # The cost critics are clipped on their own, so that watching a cost does not change what
         # the other networks learn (unless they share a features extractor that learns).
         for parameters in self.policy.clipped_together:
-            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+            if not th.isfinite(norm):  # clipped, they would be zero or no numbers
+                raise self._divergence(f"the size of the gradients is {norm.item()}")
         self.policy.optimizer.step()
+
+    def _check_learned(self) -> None:
+        """Stop before parameters that are not finite act, or are saved."""
+        learned = chain(self.policy.named_parameters(), self.policy.named_buffers())
+        for name, tensor in learned:
+            if not th.isfinite(tensor).all():
+                raise ValueError(
+                    f"{name} is not finite after {self.num_timesteps} agent steps; training stops, "
+                    f"go on from a model that was saved before. {_ADVICE}"
+                )
+
+    def _divergence(self, found: str) -> ValueError:
+        return ValueError(
+            f"{found} after {self.num_timesteps} agent steps; training stops, the model keeps its "
+            f"last finite parameters. {_ADVICE}"
+        )
 
     @contextmanager
     def _explained_divergence(self) -> Iterator[None]:
@@ -604,6 +621,13 @@ class MAPPO(PPO):
         if finished_costs and len(self.cost_limits):
             excess = violation(np.array(finished_costs), self._party_limits)
             self.multipliers.update(th.as_tensor(excess, dtype=th.float32, device=self.device))
+            if not th.isfinite(self.multipliers.values).all():
+                raise ValueError(
+                    f"the multipliers are {self.multipliers.values.tolist()} after costs of "
+                    f"{np.mean(finished_costs, axis=0).tolist()}; training stops before it learns "
+                    "from them. Scale the cost down, or limit them: multipliers_kwargs={'maximum'"
+                    ": ...}"
+                )
 
     def _update_learning_rate(self, optimizers: Any) -> None:
         super()._update_learning_rate(optimizers)

@@ -66,7 +66,7 @@ class GradientMultipliers(Multipliers):
 
     def update(self, violation: th.Tensor) -> None:
         """See :meth:`Multipliers.update`."""
-        self.values.add_(self.learning_rate * violation).clamp_(0.0, self.maximum)
+        self.values.add_(_times(self.learning_rate, violation)).clamp_(0.0, self.maximum)
 
 
 class PIDMultipliers(Multipliers):
@@ -112,10 +112,14 @@ class PIDMultipliers(Multipliers):
         """See :meth:`Multipliers.update`."""
         increase = (violation - self.previous).nan_to_num(0.0).clamp_(min=0.0)
         self.previous.copy_(violation)
-        self.integral.add_(self.ki * violation).clamp_(0.0, self.maximum)
-        proportional = (self.kp * violation).nan_to_num(0.0)  # 0 * inf: an infinite limit
-        values = proportional + self.integral + self.kd * increase
+        self.integral.add_(_times(self.ki, violation)).clamp_(0.0, self.maximum)
+        values = _times(self.kp, violation) + self.integral + self.kd * increase
         self.values.copy_(values.clamp_(0.0, self.maximum))
+
+
+def _times(gain: float, violation: th.Tensor) -> th.Tensor:
+    """Their product; a gain of 0 ignores also a violation of −∞, which an infinite limit gives."""
+    return gain * violation if gain > 0 else th.zeros_like(violation)
 
 
 def _check(initial: float, maximum: float, **gains: float) -> None:

@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from typing_extensions import override
 
+from sb3_e2c.checks import check_finite
 from sb3_e2c.sides import Side, Sides
 from sb3_e2c.worlds import Infos, Step, Worlds, close_episodes
 
@@ -150,6 +151,7 @@ class TrainedOpponents(Opponents):
 
     @override
     def start(self, observations: np.ndarray, seed: int | None) -> None:
+        check_finite(self.side.agents, "after a reset", observation=observations)
         self._observations = observations
         self._state: tuple[np.ndarray, ...] | None = None
         self._starts = np.ones(len(observations), bool)
@@ -163,6 +165,7 @@ class TrainedOpponents(Opponents):
 
     @override
     def observe(self, step: Step) -> None:
+        check_finite(self.side.agents, "after a step", observation=step.observations)
         self._observations, self._starts = step.observations, step.terminated | step.truncated
 
 
@@ -208,6 +211,7 @@ class LearningOpponents(Opponents):
         self._count(step.rewards, dones)
         model = self.model
         if not self._collecting:  # somebody evaluates, or trains by an algorithm of their own
+            check_finite(self.side.agents, "after a step", observation=step.observations)
             model._last_obs, model._last_episode_starts = step.observations, dones
             return
         model.num_timesteps += len(dones)

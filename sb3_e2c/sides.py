@@ -17,6 +17,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from typing_extensions import override
 
+from sb3_e2c.checks import Form, check_parts, check_simulator
 from sb3_e2c.world import MakeEnv, World, as_float32, check_spaces, new_env
 from sb3_e2c.worlds import (
     Infos,
@@ -26,6 +27,7 @@ from sb3_e2c.worlds import (
     batched_step,
     begin,
     begun,
+    ended_worlds,
     reset_all,
 )
 
@@ -149,6 +151,10 @@ class BatchedSides(Sides):
         team, opponents = (side(sim, list(sim.groups[group])) for group in GROUPS)
         super().__init__(sim.n_worlds, team, opponents)
         self.sim = sim
+        self._forms = {
+            group: Form(sim.n_worlds, len(each.agents), each.observation_space)
+            for group, each in zip(GROUPS, (team, opponents), strict=True)
+        }
 
     @property
     @override
@@ -160,9 +166,9 @@ class BatchedSides(Sides):
         self, seeds: Sequence[int | None], options: Infos
     ) -> tuple[tuple[np.ndarray, Infos], tuple[np.ndarray, Infos]]:
         parts = reset_all(self.sim, seeds, options)
-        team = begun([(observations["team"], infos["team"]) for observations, infos in parts])
-        opponents = begun([(observations["opponents"], {}) for observations, _ in parts])
-        return team, opponents
+        team = [(observations["team"], infos["team"]) for observations, infos in parts]
+        others = [(observations["opponents"], dict[str, Any]()) for observations, _ in parts]
+        return begun(team, self._forms["team"]), begun(others, self._forms["opponents"])
 
     @override
     def step_async(self, team: np.ndarray, opponents: np.ndarray) -> None:
@@ -173,17 +179,19 @@ class BatchedSides(Sides):
 
     @override
     def step_wait(self) -> tuple[Step, Step]:
-        observations, rewards, terminated, truncated, infos = self.sim.step(self._actions)
+        answer = check_parts("step", self.sim.step(self._actions), 5)
+        observations, rewards, terminated, truncated, infos = answer
         columns = {"team": infos["team"], "opponents": {}}
         team, opponents = (
-            batched_step(observations[g], rewards[g], terminated, truncated, columns[g])
-            for g in GROUPS
+            batched_step(f, observations[g], rewards[g], terminated, truncated, columns[g])
+            for g, f in self._forms.items()
         )
-        ended = np.flatnonzero(terminated | truncated)
+        ended = ended_worlds(team, len(self.team.agents))
         if len(ended):
-            first, first_infos = self.sim.reset(ended, [None] * len(ended), None)
-            begin(team, ended, first["team"], first_infos["team"])
-            begin(opponents, ended, first["opponents"], {})
+            answer = self.sim.reset(ended, [None] * len(ended), None)
+            first, first_infos = check_parts("reset", answer, 2)
+            begin(team, ended, self._forms["team"], first["team"], first_infos["team"])
+            begin(opponents, ended, self._forms["opponents"], first["opponents"], {})
         return team, opponents
 
     @override
@@ -306,6 +314,7 @@ def make_sides(
     agents: tuple[list[str], list[str]],
     n_worlds: int,
     n_processes: int,
+    timeout: float | None,
     batched: bool,
 ) -> Sides:
     """Worlds with two sides.
@@ -315,10 +324,12 @@ def make_sides(
     :param agents: Names of the team and of the opponents
     :param n_worlds: W
     :param n_processes: Among which SuperSuit divides the worlds
+    :param timeout: Seconds to wait for a worker process
     :param batched: Whether to use the environment's own simulator
     """
     if batched:
-        return BatchedSides(example.batched_groups(n_worlds))
+        sim = example.batched_groups(n_worlds)
+        return BatchedSides(check_simulator(sim, n_worlds, example.possible_agents))
     new_world = partial(PaddedWorld, agents=agents)
     rows: SuperSuitWorlds
     if n_processes == 1:
@@ -326,7 +337,7 @@ def make_sides(
         rows = SuperSuitWorlds(envs, new_world)
     else:
         examples = [example, new_env(make_env)]
-        rows = WorkerWorlds(make_env, examples, n_worlds, n_processes, new_world)
+        rows = WorkerWorlds(make_env, examples, n_worlds, n_processes, new_world, timeout)
     return PaddedSides(rows, example, agents)
 
 

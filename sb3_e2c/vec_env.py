@@ -12,8 +12,9 @@ Stable-Baselines3 is not used, because it loses seeds, time limits and the infos
 episode's last step.
 """
 
-from collections.abc import Sequence
-from numbers import Integral
+import math
+from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -26,6 +27,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnvStepReturn,
 )
 
+from sb3_e2c.checks import check_answer, check_simulator, named_world
 from sb3_e2c.constraints import TeamCost
 from sb3_e2c.opponents import (
     LearningOpponents,
@@ -60,6 +62,7 @@ def share_parameters(
     team_return: TeamReturn | None = None,
     team_cost: TeamCost | None = None,
     team: Sequence[str] | None = None,
+    timeout: float | None = 600.0,
 ) -> "MultiAgentVecEnv":
     """Make the worlds and give each agent of the team a row, so that all share one policy.
 
@@ -78,9 +81,13 @@ def share_parameters(
         ``env.metadata["team_cost"]``, else "sum"
     :param team: names of the agents that are trained; None reads ``env.metadata["team"]``, else
         all. If there are others, they are opponents and the result is an :class:`OpponentVecEnv`
+    :param timeout: seconds after which a worker process that does not answer is ended with an
+        error; None waits without end. Worlds of this process (``n_processes=1``) cannot be
+        interrupted: give an environment that may hang at least 2 processes
     :return: S = W·N slots, N being the size of the team
     """
     _check_request(make_env, n_worlds, n_processes, backend, seed)
+    _check_timeout(timeout)
     example = new_env(make_env)
     members, opponents = split_agents(example, team)
     critic_state_dim = _critic_state_dim(example, members[0])
@@ -89,26 +96,33 @@ def share_parameters(
     if opponents:
         agents = (members, opponents)
         batched = _has_simulator(example, backend, n_processes, agents)
-        sides = make_sides(make_env, example, agents, n_worlds, n_processes, batched)
+        sides = make_sides(make_env, example, agents, n_worlds, n_processes, timeout, batched)
         env = OpponentVecEnv(OpponentWorlds(sides), *rules)
     else:
         batched = _has_simulator(example, backend, n_processes)
         env = MultiAgentVecEnv(
-            _make_worlds(make_env, example, n_worlds, n_processes, batched), *rules
+            _make_worlds(make_env, example, n_worlds, n_processes, timeout, batched), *rules
         )
     env.seed(seed)
     return env
 
 
 def _make_worlds(
-    make_env: MakeEnv, example: Any, n_worlds: int, n_processes: int, batched: bool
+    make_env: MakeEnv,
+    example: Any,
+    n_worlds: int,
+    n_processes: int,
+    timeout: float | None,
+    batched: bool,
 ) -> Worlds:
     if batched:
-        return BatchedWorlds(example.batched(n_worlds))
+        sim = check_simulator(example.batched(n_worlds), n_worlds, example.possible_agents)
+        return BatchedWorlds(sim)
     if n_processes == 1:
         others = [new_env(make_env) for _ in range(n_worlds - 1)]
         return SuperSuitWorlds([example, *others])
-    return WorkerWorlds(make_env, [example, new_env(make_env)], n_worlds, n_processes)
+    examples = [example, new_env(make_env)]
+    return WorkerWorlds(make_env, examples, n_worlds, n_processes, timeout=timeout)
 
 
 class MultiAgentVecEnv(VecEnv):
@@ -383,8 +397,11 @@ def _has_simulator(
 
 def _critic_state_dim(env: ParallelEnv, agent: str) -> int:
     """Size of ``info["critic_state"]``, 0 where there is none."""
-    _, infos = env.reset(seed=0)
-    state = infos.get(agent, {}).get("critic_state", ())
+    with named_world("reset", 0):
+        answer = env.reset(seed=0)
+    _, infos = check_answer("reset", answer, 0)
+    info = infos.get(agent, {})
+    state = info.get("critic_state", ()) if isinstance(info, Mapping) else ()
     if np.ndim(state) != 1:
         raise ValueError(
             f"info['critic_state'] has shape {np.shape(state)}; expected one dimension, flatten it"
@@ -400,6 +417,15 @@ def _team_rule(name: str, rule: str | None, metadata: dict[str, Any], kind: Any)
             "share_parameters or in the environment's metadata"
         )
     return rule
+
+
+def _check_timeout(timeout: float | None) -> None:
+    if timeout is None:
+        return
+    if not isinstance(timeout, Real) or isinstance(timeout, bool) or not 0 < timeout < math.inf:
+        raise ValueError(
+            f"timeout is {timeout!r}; expected seconds above 0, or None to wait without end"
+        )
 
 
 def _check_request(

@@ -9,7 +9,6 @@ slot = world·N + agent; a world begins its next episode within the step that en
 
 import atexit
 import multiprocessing
-import multiprocessing.connection
 import time
 import weakref
 from abc import ABC, abstractmethod
@@ -26,6 +25,14 @@ from supersuit.vector import MakeCPUAsyncConstructor
 from supersuit.vector.multiproc_vec import decompress_info
 from typing_extensions import override
 
+from sb3_e2c.checks import (
+    Form,
+    as_type,
+    check_array,
+    check_fresh,
+    check_parts,
+)
+from sb3_e2c.workers import WorkerProcesses, is_of_a_world, kill
 from sb3_e2c.world import RESET_INFO, MakeEnv, World, as_float32, check_distinct, new_env
 
 Infos = list[dict[str, Any]]
@@ -139,10 +146,15 @@ class BatchedWorlds(Worlds):
     def __init__(self, sim: BatchedSimulator):
         super().__init__(sim.n_worlds, sim)
         self.sim = sim
+        self._form = Form(self.n_worlds, len(self.agents), self.observation_space)
+        self._last: np.ndarray | None = None  # observations of the last step
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_last": None}
 
     @override
     def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[np.ndarray, Infos]:
-        return begun(reset_all(self.sim, seeds, options))
+        return begun(reset_all(self.sim, seeds, options), self._form)
 
     @override
     def step_async(self, actions: np.ndarray) -> None:
@@ -150,13 +162,13 @@ class BatchedWorlds(Worlds):
 
     @override
     def step_wait(self) -> Step:
-        observations, rewards, terminated, truncated, columns = self.sim.step(self._actions)
-        shape = (self.n_worlds, len(self.agents))
-        assert observations.shape[:2] == rewards.shape == shape, "sim.step returns (W, N, ...)"
-        step = batched_step(observations, rewards, terminated, truncated, columns)
-        ended = np.flatnonzero(terminated | truncated)
+        answer = check_parts("step", self.sim.step(self._actions), 5)
+        self._last = check_fresh(answer[0], self._last)
+        step = batched_step(self._form, *answer)
+        ended = ended_worlds(step, len(self.agents))
         if len(ended):
-            begin(step, ended, *self.sim.reset(ended, [None] * len(ended), None))
+            first = self.sim.reset(ended, [None] * len(ended), None)
+            begin(step, ended, self._form, *check_parts("reset", first, 2))
         return step
 
     @override
@@ -184,11 +196,8 @@ class SuperSuitWorlds(Worlds):
         super().__init__(len(envs), new_world(envs[0], 0))
         self.envs = envs
         makers = [partial(_rows_of, new_world, env, world) for world, env in enumerate(envs)]
-        self.vec = self._build(makers, 1)
-
-    def _build(self, makers: Sequence[Callable[[], Any]], n_processes: int) -> Any:
-        constructor = MakeCPUAsyncConstructor(n_processes)
-        return constructor(makers, self.observation_space, self.action_space)
+        constructor = MakeCPUAsyncConstructor(1)
+        self.vec: Any = constructor(makers, self.observation_space, self.action_space)
 
     @override
     def reset(self, seeds: Sequence[int | None], options: Infos) -> tuple[Any, Infos]:
@@ -237,6 +246,7 @@ class WorkerWorlds(SuperSuitWorlds):
     :param n_worlds: W
     :param n_processes: number of workers
     :param new_world: makes a world of an environment and its number
+    :param timeout: seconds to wait for a worker's answer; None waits without end
     """
 
     def __init__(
@@ -246,6 +256,7 @@ class WorkerWorlds(SuperSuitWorlds):
         n_worlds: int,
         n_processes: int,
         new_world: NewWorld = World,
+        timeout: float | None = None,
     ):
         check_distinct(examples)
         Worlds.__init__(self, n_worlds, new_world(examples[0], 0))
@@ -254,9 +265,9 @@ class WorkerWorlds(SuperSuitWorlds):
         makers = [partial(_make_rows, new_world, make_env, world) for world in range(n_worlds)]
         others = set(multiprocessing.active_children())
         try:
-            self.vec = self._build(makers, n_processes)
+            self.vec = WorkerProcesses(makers, n_processes, self, timeout)
         except BaseException:
-            _kill([p for p in multiprocessing.active_children() if p not in others])
+            kill([p for p in multiprocessing.active_children() if p not in others])
             raise
         # Workers still alive at the interpreter's exit would be waited for, without end.
         atexit.register(_close_if_alive, weakref.ref(self))
@@ -281,36 +292,18 @@ class WorkerWorlds(SuperSuitWorlds):
 
     @contextmanager
     def _answering(self) -> Iterator[None]:
-        """Turn a broken pipe into the news that a worker died; stop all workers on any error."""
+        """Stop all workers on any error, and say which has died if a message cannot be sent."""
         try:
             yield
         except BaseException as error:
             self.failed = True
-            dead = self._dead_workers() if isinstance(error, (EOFError, OSError)) else ""
-            _kill(self.vec.procs)
+            unsent = isinstance(error, ConnectionError) and not is_of_a_world(error)
+            death = self.vec.a_death() if unsent else None
+            kill(self.vec.procs)
             self.vec.close()
-            if dead:
-                raise RuntimeError(
-                    f"{dead}; expected it to answer with its worlds' next observations. Look above "
-                    "for its traceback and for lack of memory, try n_processes=1, and make the "
-                    "environment again"
-                ) from error
+            if death is not None:
+                raise death from error
             raise
-
-    def _dead_workers(self) -> str:
-        """Name a worker that did not end by itself; a world's own exception ends it with code 0."""
-        procs = self.vec.procs
-        ended = multiprocessing.connection.wait([proc.sentinel for proc in procs], timeout=1.0)
-        for number, proc in enumerate(procs):
-            if proc.sentinel in ended:
-                proc.join(timeout=1.0)  # its pipes close a moment before it has an exit code
-            if proc.exitcode:
-                first, end = (i // len(self.agents) for i in self.vec.idx_starts[number:][:2])
-                return (
-                    f"worker process {number} (worlds {first} to {end - 1}) ended with exit code "
-                    f"{proc.exitcode}"
-                )
-        return ""
 
     @override
     def images(self) -> list[Any]:
@@ -333,7 +326,7 @@ class WorkerWorlds(SuperSuitWorlds):
         deadline = time.monotonic() + _CLOSE_SECONDS
         for proc in self.vec.procs:
             proc.join(timeout=max(0.0, deadline - time.monotonic()))
-        _kill(self.vec.procs)
+        kill(self.vec.procs)
         self.vec.close()
 
 
@@ -345,7 +338,7 @@ def _make_rows(new_world: NewWorld, make_env: MakeEnv, world: int) -> Any:
     return _rows_of(new_world, new_env(make_env), world)
 
 
-def reset_all(sim: Any, seeds: Sequence[int | None], options: Infos) -> list[tuple[Any, Any]]:
+def reset_all(sim: Any, seeds: Sequence[int | None], options: Infos) -> list[tuple[Any, ...]]:
     """Reset all worlds of a simulator, at once unless they get different options.
 
     :param sim: Its ``reset(worlds, seeds, options)`` is called
@@ -355,20 +348,34 @@ def reset_all(sim: Any, seeds: Sequence[int | None], options: Infos) -> list[tup
     """
     worlds = np.arange(len(seeds))
     if all(option is options[0] for option in options) or not any(options):
-        return [sim.reset(worlds, seeds, options[0] or None)]
-    return [sim.reset(worlds[[w]], [seeds[w]], options[w] or None) for w in range(len(worlds))]
+        return [check_parts("reset", sim.reset(worlds, seeds, options[0] or None), 2)]
+    answers = (sim.reset(worlds[[w]], [seeds[w]], options[w] or None) for w in worlds.tolist())
+    return [check_parts("reset", answer, 2) for answer in answers]
 
 
-def begun(parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]) -> tuple[np.ndarray, Infos]:
+def ended_worlds(step: Step, n_agents: int) -> np.ndarray:
+    """Numbers of the worlds whose episode ended.
+
+    :param step: of all worlds
+    :param n_agents: N
+    """
+    return np.flatnonzero((step.terminated | step.truncated)[::n_agents])
+
+
+def begun(parts: Sequence[tuple[Any, ...]], form: Form) -> tuple[np.ndarray, Infos]:
     """Observations (S, D) and infos of all slots, from a simulator's resets.
 
     :param parts: See :func:`reset_all`
+    :param form: What all of them together must be like
     """
-    infos = [row for obs, columns in parts for row in _rows(columns, obs.shape[:2])]
-    return _flat(np.concatenate([observations for observations, _ in parts])), infos
+    n_worlds = form.n_worlds // len(parts)
+    arrays = [form.observations("reset", found, n_worlds) for found, _ in parts]
+    infos = [row for _, columns in parts for row in _rows("reset", columns, n_worlds, form)]
+    return _flat(np.concatenate(arrays)), infos
 
 
 def batched_step(
+    form: Form,
     observations: np.ndarray,
     rewards: np.ndarray,
     terminated: np.ndarray,
@@ -377,40 +384,65 @@ def batched_step(
 ) -> Step:
     """Slots from what a simulator's step returned; no episode has begun yet.
 
+    :param form: What the arrays must be like
     :param observations: Shape (W, N, D); the step goes on to use this array
     :param rewards: Shape (W, N)
     :param terminated: Shape (W,)
     :param truncated: Shape (W,)
     :param columns: Arrays (W, N, ...)
     """
-    n_agents = rewards.shape[1]
+    n_worlds, n_agents, _ = form
+    ends = {"terminated": terminated, "truncated": truncated}
+    for name, flags in ends.items():
+        if check_array("step", name, flags, (n_worlds,)).dtype != bool:
+            raise ValueError(
+                f"step() of the simulator returned {name} of type {flags.dtype}; expected bool"
+            )
+    check_array("step", "rewards", rewards, (n_worlds, n_agents))
+    paid = as_type(rewards, np.float32)
+    if paid is None:
+        raise ValueError(
+            f"step() of the simulator returned rewards of type {rewards.dtype}; expected numbers"
+        )
     return Step(
-        _flat(observations),
-        np.array(rewards, dtype=np.float32).reshape(-1),
+        _flat(form.observations("step", observations, n_worlds)),
+        np.array(paid).reshape(-1),
         np.repeat(terminated, n_agents),
         np.repeat(truncated, n_agents),
-        _rows(columns, rewards.shape),
+        _rows("step", columns, n_worlds, form),
         {},
     )
 
 
 def begin(
-    step: Step, ended: np.ndarray, observations: np.ndarray, columns: dict[str, np.ndarray]
+    step: Step,
+    ended: np.ndarray,
+    form: Form,
+    observations: np.ndarray,
+    columns: dict[str, np.ndarray],
 ) -> None:
     """Begin the next episode of some worlds within the step that ended the last one.
 
     :param step: Of all worlds; edited in place
     :param ended: Numbers of the R worlds
+    :param form: What the arrays must be like
     :param observations: First ones of their next episodes, shape (R, N, D)
     :param columns: Infos of their resets, arrays (R, N, ...)
     """
-    n_agents = observations.shape[1]
+    n_agents = form.n_agents
+    first = form.observations("reset", observations, len(ended))
     slots = (ended[:, None] * n_agents + np.arange(n_agents)).ravel()
     for slot, last in zip(slots.tolist(), step.observations[slots], strict=True):
         step.infos[slot]["terminal_observation"] = last
-    step.observations[slots] = _flat(observations)
-    rows = _rows(columns, observations.shape[:2])
+    step.observations[slots] = _flat(first)
+    rows = _rows("reset", columns, len(ended), form)
     step.reset_infos.update(zip(slots.tolist(), rows, strict=True))
+
+
+def _column(call: str, name: str, found: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """One of a simulator's infos, an array (W, N, ...)."""
+    inner = found.shape[len(shape) :] if isinstance(found, np.ndarray) else ()
+    return check_array(call, f"infos[{name!r}]", found, (*shape, *inner))
 
 
 def close_episodes(step: Step) -> np.ndarray:
@@ -431,9 +463,12 @@ def _flat(array: np.ndarray) -> np.ndarray:
     return array.reshape(-1, *array.shape[2:])
 
 
-def _rows(columns: dict[str, np.ndarray], shape: tuple[int, ...]) -> Infos:
+def _rows(call: str, columns: dict[str, np.ndarray], n_worlds: int, form: Form) -> Infos:
     """Infos of every slot, from arrays (W, N, ...): Python numbers and rows of arrays."""
-    flat = [_flat(column) for column in columns.values()]
+    shape = (n_worlds, form.n_agents)
+    if not isinstance(columns, dict):
+        raise ValueError(f"{call}() of the simulator returned infos {columns!r}; expected a dict")
+    flat = [_flat(_column(call, name, column, shape)) for name, column in columns.items()]
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in flat]
     if not lists:
         return [{} for _ in range(int(np.prod(shape)))]
@@ -441,13 +476,6 @@ def _rows(columns: dict[str, np.ndarray], shape: tuple[int, ...]) -> Infos:
         (name,) = columns
         return [{name: value} for value in lists[0]]
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
-
-
-def _kill(procs: list[Any]) -> None:
-    for proc in procs:
-        if proc.is_alive():
-            proc.kill()
-        proc.join()
 
 
 def _close_if_alive(reference: "weakref.ref[WorkerWorlds]") -> None:

@@ -568,7 +568,7 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
         (["--device", "cuda:99"], "--device is 'cuda:99', but torch finds"),
         (["-f", ""], "--log-folder is empty"),
         (["-tb", "/proc/x"], "--tensorboard-log /proc/x: cannot write there"),
-        (["--flag"], "unknown flag '--flag'"),
+        (["--flag"], "unrecognized arguments: --flag"),
         (["-i", "missing.zip"], "-i missing.zip"),
         (["-conf", "missing.yml"], "cannot read missing.yml"),
         (["-optimize"], "-optimize"),

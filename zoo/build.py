@@ -1,6 +1,7 @@
 """From names and numbers to objects: worlds, models, and their weights."""
 
 import contextlib
+import itertools
 import math
 import os
 import pickle
@@ -124,6 +125,26 @@ def build_model(algo: str, config: Mapping[str, Any], env: VecEnv, **flags: Any)
     _check_memory(f"{n_steps} steps of {env.num_envs} agents", n_steps * env.num_envs * row)
     with refusals_of(algo):
         return ALGORITHMS[algo](env=env, **arguments, **flags)
+
+
+def check_networks(config: Mapping[str, Any], path: str | Path) -> None:
+    """Refuse a configuration whose networks the file cannot hold, before they take any memory.
+
+    :param config: See :func:`sb3_e2c.zoo.configuration.resolve`
+    :param path: The model's zip file
+    :raises UserError: if they are larger
+    """
+    kwargs = config.get("policy_kwargs") or {}
+    layers = kwargs.get("net_arch") or []
+    chains = list(layers.values()) if isinstance(layers, Mapping) else [layers]
+    least = 3 * kwargs.get("gru_hidden_size", 0) ** 2
+    least += sum(a * b for chain in chains for a, b in itertools.pairwise(chain))
+    found = os.path.getsize(path) if os.path.exists(path) else math.inf
+    if least > found:  # a weight has four bytes, and hardly compresses
+        raise UserError(
+            f"{path} has {found:,} bytes, but the networks in config.yml {least:,} weights; does "
+            "it belong to this run?"
+        )
 
 
 def load_weights(model: MAPPO, path: str | Path) -> None:

@@ -325,9 +325,9 @@ class TeamExperimentManager(ExperimentManager):
         except (ValueError, RuntimeError, MemoryError, OSError) as error:
             with contextlib.suppress(OSError):  # the disk may be full
                 self.points.write()
-            raise UserError(
-                f"training stopped: {brief(error)}; {self.save_path} keeps what was saved before"
-            ) from error
+            there = os.path.exists(self.save_path)
+            kept = f"; {self.save_path} keeps what was saved before" if there else ""
+            raise UserError(f"training stopped: {brief(error)}{kept}") from error
         finally:
             ignore_stop_signals()
             self._release(model)
@@ -335,8 +335,11 @@ class TeamExperimentManager(ExperimentManager):
     def _release(self, model: BaseAlgorithm) -> None:
         """Write the log of the last update, then close logs, progress bar and worlds."""
         model.logger.record("time/total_timesteps", model.num_timesteps)
-        model.logger.dump(model.num_timesteps)
-        model.logger.close()
+        try:
+            model.logger.dump(model.num_timesteps)
+            model.logger.close()
+        except (OSError, ValueError) as error:  # perhaps the disk that has stopped the training
+            print(f"The last row of the log is lost: {brief(error)}")
         for callback in self.callbacks:
             if isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
                 callback.pbar.close()

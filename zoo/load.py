@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.hf_api import ModelInfo
 from rl_zoo3.utils import get_latest_run_id
 
+from sb3_e2c.zoo.archives import check_archive, is_inside
 from sb3_e2c.zoo.configuration import check, check_algo, check_env, read_yaml
 from sb3_e2c.zoo.console import (
     ConsoleParser,
@@ -105,19 +106,10 @@ def files_of_a_team(info: ModelInfo) -> list[str]:
     return names
 
 
-def is_inside(name: str) -> bool:
-    """Whether a name from a list or an archive stays in the folder that it is put in.
-
-    :param name: With "/" between folders
-    """
-    path = PurePosixPath(name)
-    return not (path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name)
-
-
-def _check_size(name: str, size: int | None, what: str = "bytes") -> None:
+def _check_size(name: str, size: int | None) -> None:
     if size is None or size > LARGEST[name]:
         found = "an unknown number of" if size is None else f"{size:,}"
-        raise UserError(f"{name} has {found} {what}; expected at most {LARGEST[name]:,}")
+        raise UserError(f"{name} has {found} bytes; expected at most {LARGEST[name]:,}")
 
 
 def check_files(folder: Path, names: Sequence[str]) -> None:
@@ -133,30 +125,13 @@ def check_files(folder: Path, names: Sequence[str]) -> None:
             raise UserError(f"{name} has not arrived as a file")
         _check_size(name, path.stat().st_size)
         if path.suffix in (".zip", ".npz"):
-            with path.open("rb") as file:
-                _check_archive(name, file)
+            try:
+                check_archive(path, LARGEST[name])
+            except Exception as error:  # whatever zip files raise for broken content
+                raise UserError(f"{name}: {brief(error)}") from error
     statistics = folder / "model.vecnormalize.npz"
     if statistics.name in names:
         _check_numbers(statistics)
-
-
-def _check_archive(name: str, file: Any) -> None:
-    """Refuse an archive that would unpack to too much, or elsewhere; also those in a model.
-
-    Python reads no more of a member than its size that we add up here.
-    """
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            _check_size(name, sum(member.file_size for member in members), "bytes unpacked")
-            for member in members:
-                if not is_inside(member.filename):
-                    raise UserError(f"{name}: {member.filename!r} would unpack elsewhere")
-                if member.filename.endswith(".pth"):
-                    with archive.open(member) as inner:
-                        _check_archive(name, inner)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
-        raise UserError(f"{name} is damaged: {brief(error)}") from error
 
 
 def _check_numbers(path: Path) -> None:
@@ -199,7 +174,7 @@ def _read_untrusted(path: Path) -> dict[str, Any]:
     try:
         for token in yaml.scan(path.read_text()):
             depth += isinstance(token, _OPENING) - isinstance(token, _CLOSING)
-            if isinstance(token, yaml.AliasToken) :
+            if isinstance(token, yaml.AliasToken) or depth > _DEEPEST:
                 raise UserError(
                     f"{path.name} has aliases, or more than {_DEEPEST} levels; expected plain YAML"
                 )

@@ -200,10 +200,16 @@ class ProgressFile(KVWriter):
         self.n_rows += 1
 
     def _add_columns(self, keys: list[str]) -> None:
-        self._file.close()
-        self.keys += keys
         rows = self.path.read_text().splitlines()[1:]
-        self._rewrite([",".join(self.keys) + "\n", *(row + "," * len(keys) + "\n" for row in rows)])
+        all_keys = [*self.keys, *keys]
+        self._file.close()  # not every system replaces an open file
+        try:
+            head = ",".join(all_keys) + "\n"
+            self._rewrite([head, *(row + "," * len(keys) + "\n" for row in rows)])
+        except OSError:
+            self._file = self.path.open("a")  # go on with what is there
+            raise
+        self.keys = all_keys
 
     def _rewrite(self, lines: list[str]) -> None:
         write_whole(self.path, "".join(lines))
@@ -243,7 +249,9 @@ def _sync(path: Path) -> None:
 # ------------------------------------------------------------------ a run
 
 # Flags that may differ from those that a run was started with
-_MAY_DIFFER = {"resume", "resume_every", "n_timesteps", "verbose", "progress", "device"}
+_MAY_DIFFER = {
+    *("resume", "resume_every", "n_timesteps", "verbose", "progress", "device", "trust"),
+}
 
 
 def resumed_arguments(
@@ -265,8 +273,9 @@ def resumed_arguments(
                 f"--resume {run} goes on with {flags[name]} {started[name]}, and {flags[name]} "
                 f"{given[name]} contradicts it; leave it away, or start a new run"
             )
-    # The point holds what -i had loaded, and the total that -n asked for.
-    always = {"n_timesteps": -1, "trained_agent": "", "log_folder": str(run.absolute().parents[1])}
+    # The point holds what -i had loaded, and the total that -n asked for; trust is not inherited.
+    always = {"n_timesteps": -1, "trained_agent": "", "trust": False}
+    always["log_folder"] = str(run.absolute().parents[1])
     return Namespace(**started | always | {k: given[k] for k in given.keys() & _MAY_DIFFER})
 
 
@@ -455,6 +464,7 @@ class Resumable:
         """Write the latest point to the disk, and remove all but the one before it."""
         if self.latest is None or self.latest is self._written:
             return
+        self.check_there()
         _sync(self.monitor)
         _sync(self.run / "progress.csv")
         path = self._path(self.latest)
@@ -469,6 +479,14 @@ class Resumable:
         """Write the latest point if the last one is old enough."""
         if self._written is None or time.monotonic() - self._written_at >= self.every:
             self.write()
+
+    def check_there(self) -> None:
+        """Raise if the folder is gone: writing would make one that nobody can resume."""
+        if not Path(self._lock.lock_file).exists():
+            raise FileNotFoundError(
+                f"{self.run} was deleted or renamed while it trained; if it has another name now, "
+                f"go on with: {how_to_go_on(Path('ITS-NEW-NAME'))}"
+            )
 
     def _path(self, point: Point) -> Path:
         return self.run / FOLDER / f"{point.steps:012}{_SUFFIX}"
@@ -497,6 +515,7 @@ class KeepPoints(BaseCallback):
         return self.locals["callback"]
 
     def _on_rollout_start(self) -> None:
+        self.points.check_there()
         if not self._restored:
             self._restored = True
             self._restore()

@@ -17,6 +17,7 @@ from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.build import (
     build_model,
     check_finite,
+    check_networks,
     load_opponent,
     load_weights,
     make_worlds,
@@ -157,6 +158,7 @@ def load_model(
     if against is not None:
         against.set_opponent("random")  # for now, so that the model brings none of its own
     if not trust:
+        check_networks(run.config, run.model_path)
         model = build_model(run.algo, run.config, env, seed=seed, device=device)
         load_weights(model, run.model_path)
     else:

@@ -25,6 +25,7 @@ from sb3_e2c.zoo.configuration import (
     check_env,
     parse_presets,
     preset_names,
+    read_yaml,
 )
 from sb3_e2c.zoo.console import (
     ConsoleParser,
@@ -154,6 +155,12 @@ class TrainParser(ConsoleParser):
             help="How often to write a resume point to the disk, at the end of a rollout "
             "(default: 60; 0: always). A stopped run writes its latest in any case",
         )
+        self.add_argument(
+            "--trust",
+            action="store_true",
+            help="With -i or --resume of a run that sb3-e2c load has fetched: unpickle it, which "
+            "can execute what its author has put there",
+        )
         defaults = vars(super().parse_args([]))
         unset = object()
         typed = super().parse_args(self.argv, argparse.Namespace(**dict.fromkeys(defaults, unset)))
@@ -182,6 +189,7 @@ class _Refuse(argparse.Action):
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse what cannot be meant, before anything is built or written."""
+    _check_own(args)
     _import_packages(args.gym_packages)
     register()
     check_algo(args.algo)
@@ -201,6 +209,18 @@ def _check(args: argparse.Namespace) -> None:
             f"--opponent is {args.opponent}; expected own, random, or the .zip file of an adversary"
         )
     configure(args)
+
+
+def _check_own(args: argparse.Namespace) -> None:
+    """Refuse to unpickle what ``load`` has fetched, unless its author is trusted."""
+    continued = args.trained_agent and Path(args.trained_agent).parent
+    for flag, run in (("--resume", args.resume), ("-i", continued)):
+        saved = Path(run, args.env, "args.yml")
+        if run and not args.trust and saved.is_file() and "repo_id" in read_yaml(saved):
+            raise UserError(
+                f"{flag}: {run} was fetched from the hub, and to go on with it is to unpickle it, "
+                "which can execute what its author has put there; say --trust if you want that"
+            )
 
 
 def _import_packages(names: Sequence[str]) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import os
+import traceback
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -99,6 +100,8 @@ def fork(act, *args):
             status = 0
         except SystemExit as exit_:
             status = exit_.code or 0
+        except BaseException:
+            traceback.print_exc()  # the table shows what it did not expect
         finally:
             os._exit(status if isinstance(status, int) else 1)
     return pid

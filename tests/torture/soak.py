@@ -7,6 +7,7 @@ writes soak/ENV.csv, a row every few seconds, and soak/ENV.png. Linux only: it r
 
 import argparse
 import csv
+import gc
 import os
 import signal
 import time
@@ -15,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from sb3_e2c import OEMRewardCallback
 from sb3_e2c.zoo import train
-from torture.runs import fork, wait
+from torture.runs import ROVERS, Outcome, flags, fork, wait
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 COLUMNS = ("seconds", "rss_mib", "handles", "log_kib", "other_kib", "agent_steps")
@@ -97,6 +99,54 @@ def slopes(path):
         "other KiB": (late["other_kib"].min(), late["other_kib"].max()),
         "agent steps": table["agent_steps"].max(),
     }
+
+
+def grows(folder, rollouts=200):
+    """Many short rollouts with everything that ``train`` has; what grew in the last half of them.
+
+    :return: MiB of memory, handles, rows of progress.csv a rollout, largest sizes that must not
+        grow: of the estimator's memory in observations, of the episodes that the model keeps, and
+        of resume points in number
+    """
+    from sb3_e2c.zoo.resume import KeepPoints
+
+    seen, real = [], KeepPoints._on_rollout_start
+
+    def on_rollout_start(self):
+        real(self)
+        oem = next(c for c in self._everything.callbacks if isinstance(c, OEMRewardCallback))
+        capacity = oem.estimator._memory.columns.shape[2]
+        points = len(list(self.points.run.glob("resume/*.point")))
+        kept = len(self.model.ep_info_buffer)
+        gc.collect()
+        seen.append((*measure(), self.points.progress.n_rows, capacity, kept, points))
+
+    KeepPoints._on_rollout_start = on_rollout_start
+    try:
+        train.train(flags(folder, ROVERS, rollouts))
+    finally:
+        KeepPoints._on_rollout_start = real
+    table = np.array(seen)
+    growth = table[-1] - table[len(table) // 2]
+    return growth[0], growth[1], growth[2] / (len(table) - len(table) // 2), table[:, 3:].max(axis=0)
+
+
+def torture(folder, rollouts=200):
+    """A line of the table.
+
+    :param folder: An empty folder
+    """
+    memory, handles, rows, (capacity, kept, points) = grows(folder, rollouts)
+    found = {
+        f"memory grew by {memory:.1f} MiB": memory > 4,
+        f"handles grew by {handles}": handles > 0,
+        f"{rows:.1f} rows of progress.csv for each rollout": rows > 2,
+        f"an estimator remembers {capacity} observations": capacity > 64,
+        f"the model keeps {kept} episodes": kept > 100,
+        f"{points} resume points": points > 2,
+    }
+    notes = tuple(what for what, wrong in found.items() if wrong)
+    yield Outcome(f"soak: {rollouts} rollouts", len(found), wrong=len(notes), notes=notes)
 
 
 def plot(path):
