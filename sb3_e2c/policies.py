@@ -56,6 +56,7 @@ class RunningNorm(nn.Module):
         """Take the targets of a rollout into account (Chan et al.'s parallel variance).
 
         :param targets: Shape (..., size)
+        :raises ValueError: if their squares are beyond float32; nothing has changed then
         """
         if not targets.numel():
             return
@@ -64,7 +65,14 @@ class RunningNorm(nn.Module):
         delta = targets.mean(dim=0) - self.mean
         var = targets.var(dim=0, unbiased=False)
         spread = delta**2 * (self.count * n / total)
-        self.var.copy_((self.var * self.count + var * n + spread) / total)
+        var = (self.var * self.count + var * n + spread) / total
+        if not th.isfinite(var).all():
+            raise ValueError(
+                f"the critics' targets reach {targets.abs().max().item():g}, and their variance is "
+                f"{var.max().item()}; training stops before the networks learn from them. Scale "
+                "rewards and costs down, for example by reward_scale"
+            )
+        self.var.copy_(var)
         self.mean.add_(delta * (n / total))
         self.count.copy_(total)
 

@@ -32,8 +32,9 @@ def gae(
     advantages = np.zeros_like(rewards)
     alive = 1.0 - dones.astype(rewards.dtype)
     next_values, next_advantages = last_values, np.zeros_like(last_values)
-    for t in reversed(range(len(rewards))):
-        delta = rewards[t] + gamma * alive[t] * next_values - values[t]
-        advantages[t] = delta + gamma * gae_lambda * alive[t] * next_advantages
-        next_values, next_advantages = values[t], advantages[t]
+    with np.errstate(over="ignore", invalid="ignore"):  # learners stop at what is not finite
+        for t in reversed(range(len(rewards))):
+            delta = rewards[t] + gamma * alive[t] * next_values - values[t]
+            advantages[t] = delta + gamma * gae_lambda * alive[t] * next_advantages
+            next_values, next_advantages = values[t], advantages[t]
     return advantages

@@ -401,12 +401,12 @@ def test_random_faults_at_random_moments_always_end_in_an_error():
             answer = super().step(actions)
             if rng.random() > 0.05:
                 return answer
-            place, value, _ = SPOILED[fault]
+            place, value, _ = SPOILED[self.fault]
             return spoiled(answer, place, value)
 
     model = MAPPO("MlpPolicy", share_parameters(Dice, 1), cost_limits=1.0, **SMALL)
     before = th.nn.utils.parameters_to_vector(model.policy.parameters())
-    for fault in rng.permutation(list(SPOILED) * 2).tolist():
+    for Dice.fault in rng.permutation(list(SPOILED) * 2).tolist():
         with pytest.raises(ValueError, match=LAST):
             model.learn(10_000)
         parameters = th.nn.utils.parameters_to_vector(model.policy.parameters())

@@ -2,11 +2,11 @@
 
 import errno
 import random
+import shutil
 import signal
 import sys
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("rl_zoo3")
@@ -14,11 +14,9 @@ if sys.platform != "linux":
     pytest.skip("kills processes and reads /proc", allow_module_level=True)
 
 from torture import crash, fuzz, soak, untrusted
-from torture.runs import PREY, ROVERS, flags, results, run_in, trained, wait
+from torture.runs import PREY, flags, results, run_in, trained, wait
 
-from sb3_e2c.zoo import build, runs, train
-from sb3_e2c.zoo.configuration import read_yaml
-from sb3_e2c.zoo.console import UserError
+from sb3_e2c.zoo import build, train
 
 
 @pytest.fixture(scope="module")
@@ -84,19 +82,84 @@ def test_a_traceback_and_a_hang_are_seen(monkeypatch):
         while number == 2:
             pass
 
-    monkeypatch.setattr(fuzz.deadline, "__wrapped__", fuzz.deadline.__wrapped__, raising=False)
     found = fuzz.fuzz("test", st.integers(0, 2), act, 30)
     assert found.wrong >= 2
     assert any("KeyError" in note for note in found.notes)
     assert any("hang" in note for note in found.notes)
 
 
-@given(text=fuzz.yamls(fuzz.configurations))
-@settings(max_examples=50, deadline=None, database=None, derandomize=True)
-def test_yaml_is_a_mapping_or_a_user_error(text, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "fuzzed.yml"
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    try:
-        assert isinstance(read_yaml(path), dict)
-    except UserError as error:
-        assert str(path) in str(error)
+# ---------------------------------------------------------------------------- a stranger's run
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory):
+    """A log folder with a run whose files others may have changed."""
+    logs = tmp_path_factory.mktemp("stranger") / "logs"
+    trained(logs, PREY)
+    return logs
+
+
+def tried(stranger, tmp_path, spoil, *names):
+    """What commands make of a spoiled copy of the run."""
+    return untrusted.attempt(stranger, spoil, names, tmp_path / "executed", tmp_path)
+
+
+def test_payloads_are_live_and_trust_executes_them(stranger, tmp_path):
+    untrusted.control(stranger, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("place", "command"),
+    [
+        (f"{PREY}.zip: data", "export"),
+        (f"{PREY}.zip: policy.pth (zip)", "enjoy"),
+        (f"{PREY}.zip: policy.pth (legacy)", "enjoy"),
+        (f"{PREY}.zip: policy.optimizer.pth (tar)", "push"),
+        (f"{PREY}.zip: more.pth (plain)", "record"),
+        (f"{PREY}.adversary.zip: policy.pth (zip)", "train --opponent FILE"),
+        (f"{PREY}.vecnormalize.npz: object arrays", "enjoy"),
+        (f"{PREY}.vecnormalize.npz: a pickle", "enjoy"),
+        (f"{PREY}/vecnormalize.pkl", "enjoy"),
+        ("resume points", "enjoy"),
+        ("config.yml: objects", "enjoy"),
+        ("config.yml: callback", "plot"),
+    ],
+)
+def test_no_payload_is_executed(stranger, tmp_path, place, command):
+    run = run_in(stranger)
+    spoils = dict(untrusted.poisons(run, untrusted.Payload(tmp_path / "executed")))
+    found = tried(stranger, tmp_path, spoils[place], command)
+    assert found[command] in ("works", "refused")
+
+
+@pytest.mark.parametrize("lie", untrusted.lies())
+def test_archives_and_yaml_that_lie_are_refused_in_one_line(stranger, tmp_path, lie):
+    assert tried(stranger, tmp_path, untrusted.lies()[lie], "enjoy") == {"enjoy": "refused"}
+
+
+def test_a_bomb_would_be_seen(stranger, tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "check_archive", lambda *_: None)
+    spoil = untrusted.lies()["bomb: the weights"]
+    assert tried(stranger, tmp_path, spoil, "enjoy") == {"enjoy": "memory"}
+
+
+@pytest.mark.parametrize("flag", ["--resume", "-i"])
+def test_a_run_from_the_hub_is_unpickled_only_if_it_is_trusted(stranger, tmp_path, capsys, flag):
+    logs = shutil.copytree(stranger, tmp_path / "logs")
+    run = run_in(logs)
+    untrusted._change(run / PREY / "args.yml", repo_id="somebody/prey", trust=True)
+    what = run if flag == "--resume" else run / f"{PREY}.zip"
+    argv = ["--env", PREY, "-f", str(logs), flag, str(what)]
+    with pytest.raises(SystemExit):
+        train.main(argv)
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "to unpickle it, which can execute" in line
+    assert train.train([*argv, "--trust", "-n", "600", "--verbose", "0"]).exists()
+
+
+# ---------------------------------------------------------------------------- soak
+
+
+def test_a_long_training_does_not_grow(tmp_path):
+    (found,) = soak.torture(tmp_path)
+    assert found.notes == ()

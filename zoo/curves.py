@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_e2c.zoo.configuration import read_yaml, team_limits
-from sb3_e2c.zoo.console import UserError, check_file, write_whole
+from sb3_e2c.zoo.console import UserError, brief, check_file, write_whole
 from sb3_e2c.zoo.figures import tidy
 from sb3_e2c.zoo.results import agent_steps, read_table
 
@@ -33,6 +33,20 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
     args, config = _settings(folder)
     progress = read_table(folder / "progress.csv")
     episodes = read_table(folder / "monitor.csv", comment="#")
+    try:
+        write_whole(out, _draw(args, config, episodes, progress))
+    except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{folder}: monitor.csv or progress.csv is damaged, or none of train: "
+            f"{brief(repr(error))}"
+        ) from error
+    return out
+
+
+def _draw(
+    args: dict[str, Any], config: dict[str, Any], episodes: pd.DataFrame, progress: pd.DataFrame
+) -> bytes:
+    """The picture, as a PNG file."""
     steps = agent_steps(episodes, progress)
     figure = Figure(figsize=(12, 3.6), layout="constrained", dpi=150)
     reward, cost, multipliers = figure.subplots(1, 3)
@@ -50,8 +64,7 @@ def plot_learning(run_folder: str | Path, out: str | Path | None = None) -> Path
         tidy(axes)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
-    write_whole(out, picture.getvalue())
-    return out
+    return picture.getvalue()
 
 
 def _settings(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:

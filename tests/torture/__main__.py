@@ -1,7 +1,7 @@
 """Prints a table of faults: tried, survived, work lost, something else wrong. Linux only.
 
-    PYTHONPATH=tests python -m torture          about 8 minutes; exit status 1 if anything is lost
-    PYTHONPATH=tests python -m torture --long   10,000 fuzzed cases, 600 kills
+PYTHONPATH=tests python -m torture          about 8 minutes; exit status 1 if anything is lost
+PYTHONPATH=tests python -m torture --long   10,000 fuzzed cases, 600 kills
 """
 
 import argparse
@@ -47,7 +47,10 @@ def main():
         for note in outcome.notes:
             print(f"    {note}", flush=True)
         found.append(outcome)
-    sums = [sum(getattr(each, name) for each in found) for name in ("tried", "survived", "lost", "wrong")]
+    sums = [
+        sum(getattr(each, name) for each in found)
+        for name in ("tried", "survived", "lost", "wrong")
+    ]
     print(row("all", *sums, round(time.monotonic() - start)))
     shutil.rmtree(folder, ignore_errors=True)
     sys.exit(int(sums[2] + sums[3] > 0))

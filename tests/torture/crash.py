@@ -17,7 +17,18 @@ import numpy as np
 
 from sb3_e2c.zoo import train
 from sb3_e2c.zoo.resume import newest_point
-from torture.runs import ROVERS, Outcome, flags, fork, quietly, results, run_in, trained, wait, weights
+from torture.runs import (
+    ROVERS,
+    Outcome,
+    flags,
+    fork,
+    quietly,
+    results,
+    run_in,
+    trained,
+    wait,
+    weights,
+)
 
 # ---------------------------------------------------------------------------- faults
 
@@ -298,7 +309,9 @@ def tmpfs(folder, kib):
             raise SystemExit(77)
 
     def act():
-        if libc.unshare(_NEW_NAMESPACE) != 0 or libc.mount(b"none", b"/", None, 1 << 18 | 1 << 14, None):
+        if libc.unshare(_NEW_NAMESPACE) != 0 or libc.mount(
+            b"none", b"/", None, 1 << 18 | 1 << 14, None
+        ):
             raise SystemExit(77)
         mount(f"size={kib}k")
         status, _, error = quietly(train.main, flags(place / "logs"))
@@ -322,7 +335,9 @@ def read_only(folder):
     folder.mkdir(parents=True)
 
     def act():
-        if libc.unshare(_NEW_NAMESPACE) != 0 or libc.mount(b"none", b"/", None, 1 << 18 | 1 << 14, None):
+        if libc.unshare(_NEW_NAMESPACE) != 0 or libc.mount(
+            b"none", b"/", None, 1 << 18 | 1 << 14, None
+        ):
             raise SystemExit(77)
         if libc.mount(b"tmpfs", str(folder).encode(), b"tmpfs", _READ_ONLY, b"size=1m") != 0:
             raise SystemExit(77)

@@ -51,14 +51,14 @@ class Hang(BaseException):
 
 
 @contextmanager
-def deadline(seconds=SECONDS):
+def deadline():
     """Interrupt what takes too long."""
 
     def stop(*_):
         raise Hang
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
     try:
         yield
     finally:
@@ -115,16 +115,52 @@ def _place(error):
 
 NUMBERS = ["0", "-1", "1", "2", "7", "1e3", "3.5", "nan", "inf", "-inf", "9" * 20, "9" * 400]
 NUMBERS += ["1e400", "1_0", "0x10", "½", "１", "-0.0", "1e-320", str(2**32), str(2**63)]
-NAMES = ["", " ", "logs", "conf.yml", "model.zip", "garbage.zip", "missing", "new/folder", "a" * 300]
+NAMES = [
+    "",
+    " ",
+    "logs",
+    "conf.yml",
+    "model.zip",
+    "garbage.zip",
+    "missing",
+    "new/folder",
+    "a" * 300,
+]
 NAMES += ["ü", "\udcff", "a\nb", "-x", "--", "@a", "auto", "cpu", "cuda:9", "best", "own", "random"]
 NAMES += [*ALGORITHMS, PREY, "MultiRover-6-3-v0", "SafeAnt-2x4-v0", *preset_names(), "no/body"]
 NAMES += ["gru,lambda_1", "a.gif", "a.mp4", "sqlite:///missing/a.db", "smoke", "paper", "e2c-t"]
 VALUES = [*NUMBERS, "", "true", "null", "[1,2]", "[]", "dict(a=1)", "lin_1e-3", "lin_nan", "[[1]]"]
-VALUES += ["{1: 2}", "9**9**9", "__import__('os')", "(" * 300, "-" * 5000 + "1", "[" * 90 + "]" * 90]
+VALUES += [
+    "{1: 2}",
+    "9**9**9",
+    "__import__('os')",
+    "(" * 300,
+    "-" * 5000 + "1",
+    "[" * 90 + "]" * 90,
+]
 VALUES += ["'a", "visit_count", "nearest_neighbor", "GruPolicy", "Tanh", "PIDMultipliers", "b'1'"]
 VALUES += ["1j", "...", "{1, 2}", "dict(**a)", "dict([1])", "f'{1}'", "'a' * 9", "0777"]
-INNER = ["psi", "estimator", "estimator_kwargs", "k", "net_arch", "activation_fn", "pi", "learning_rate"]
-INNER += ["max_cycles", "n_predators", "", "a", "optimizer_kwargs", "shape", "initial", "eps", "betas"]
+INNER = [
+    "psi",
+    "estimator",
+    "estimator_kwargs",
+    "k",
+    "net_arch",
+    "activation_fn",
+    "pi",
+    "learning_rate",
+]
+INNER += [
+    "max_cycles",
+    "n_predators",
+    "",
+    "a",
+    "optimizer_kwargs",
+    "shape",
+    "initial",
+    "eps",
+    "betas",
+]
 KEYS = [*keys("e2c_t"), "seed", "device", "policy_kwarg", "", "1", "__class__"]
 
 words = st.sampled_from([*NUMBERS, *NAMES]) | st.text(
@@ -252,8 +288,10 @@ plain = st.one_of(
 )
 values = st.recursive(
     plain,
-    lambda inner: st.lists(inner, max_size=3)
-    | st.dictionaries(st.sampled_from([*KEYS, *INNER]) | plain, inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from([*KEYS, *INNER]) | plain, inner, max_size=3)
+    ),
     max_leaves=6,
 )
 configurations = st.dictionaries(st.sampled_from(KEYS) | plain, values, max_size=4)
@@ -275,17 +313,30 @@ suites = st.fixed_dictionaries(
     optional={k: values for k in ("title", "seeds", "window", "n_timesteps", "preset", "a")},
 )
 edits = st.lists(
-    st.tuples(st.integers(0, 400), st.sampled_from(list("{}[]:-&*!|>'\"%@#\n\t ,?")) | st.text(max_size=2)),
+    st.tuples(
+        st.integers(0, 400), st.sampled_from(list("{}[]:-&*!|>'\"%@#\n\t ,?")) | st.text(max_size=2)
+    ),
     max_size=2,
 )
-TAGS = ["!!bool x", "!!int ''", "!!float x", "2001-99-99", "!!binary é", "!!set {a}", "<<: 1", "=: 1"]
+TAGS = [
+    "!!bool x",
+    "!!int ''",
+    "!!float x",
+    "2001-99-99",
+    "!!binary é",
+    "!!set {a}",
+    "<<: 1",
+    "=: 1",
+]
 TAGS += ["!!python/name:os.system", "&a [*a]", "*nobody", "? [a]", "!!timestamp x", "!!pairs 1"]
 
 
 def yamls(content):
     """Texts of YAML files that are right, nearly, or not at all."""
     dumped = st.builds(_edited, content.map(_dump), edits)
-    tagged = st.builds("{}\n{}: {}".format, content.map(_dump), st.sampled_from(KEYS), st.sampled_from(TAGS))
+    tagged = st.builds(
+        "{}\n{}: {}".format, content.map(_dump), st.sampled_from(KEYS), st.sampled_from(TAGS)
+    )
     return dumped | tagged | st.text(max_size=30)
 
 
@@ -423,7 +474,9 @@ def try_part(case):
 
 
 def try_worlds(kwargs):
-    return clear(lambda: share_parameters(**{"make_env": TwoOnALine, "n_worlds": 1, **kwargs}).close())
+    return clear(
+        lambda: share_parameters(**{"make_env": TwoOnALine, "n_worlds": 1, **kwargs}).close()
+    )
 
 
 PARTS = [
@@ -439,13 +492,24 @@ parts = st.one_of(
         st.tuples(
             st.just(kind),
             arguments(names).map(
-                lambda kw, kind=kind: {"shape": (1, 1), **kw} if "Multipliers" in kind.__name__ else kw
+                lambda kw, kind=kind: (
+                    {"shape": (1, 1), **kw} if "Multipliers" in kind.__name__ else kw
+                )
             ),
         )
         for kind, names in PARTS
     ]
 )
-WORLDS = ["n_worlds", "n_processes", "seed", "backend", "team_return", "team_cost", "team", "make_env"]
+WORLDS = [
+    "n_worlds",
+    "n_processes",
+    "seed",
+    "backend",
+    "team_return",
+    "team_cost",
+    "team",
+    "make_env",
+]
 # More than one process would be started
 worlds = arguments(WORLDS).filter(lambda kw: kw.get("n_processes", 1) in (1, None, "a", 0, -1))
 worlds = worlds.filter(lambda kw: not _is_many(kw.get("n_worlds", 1)))
@@ -479,7 +543,9 @@ def spoil(content, kind, where, length, new):
     }
     if kind == "cut":
         return content[:at]
-    return content[at:] if kind == "behead" else content[:at] + changes[kind] + content[at + length :]
+    return (
+        content[at:] if kind == "behead" else content[:at] + changes[kind] + content[at + length :]
+    )
 
 
 class Files:

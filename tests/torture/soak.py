@@ -128,7 +128,12 @@ def grows(folder, rollouts=200):
         KeepPoints._on_rollout_start = real
     table = np.array(seen)
     growth = table[-1] - table[len(table) // 2]
-    return growth[0], growth[1], growth[2] / (len(table) - len(table) // 2), table[:, 3:].max(axis=0)
+    return (
+        growth[0],
+        growth[1],
+        growth[2] / (len(table) - len(table) // 2),
+        table[:, 3:].max(axis=0),
+    )
 
 
 def torture(folder, rollouts=200):

@@ -269,9 +269,7 @@ def _laughs():
 
 def _merges():
     lines = ["\na: &a0 {b: 1, c: 2, d: 3}"]
-    lines += [
-        f"a{n}: &a{n} {{<<: [{','.join([f'*a{n - 1}'] * 10)}]}}" for n in range(1, 12)
-    ]
+    lines += [f"a{n}: &a{n} {{<<: [{','.join([f'*a{n - 1}'] * 10)}]}}" for n in range(1, 12)]
     return "\n".join(lines)
 
 
