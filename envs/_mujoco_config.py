@@ -168,12 +168,6 @@ class RobotConfig:
         return np.array([joined.index(motor) for motor in MOTORS[self.scenario]])
 
 
-def check_render_mode(render_mode: str | None) -> None:
-    """Refuse an unknown mode."""
-    if render_mode not in (None, *METADATA["render_modes"]):
-        raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-
-
 def _check_count(name: str, value: object, least: int) -> None:
     if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
         raise ValueError(f"{name} is {value!r}; expected an integer of at least {least}")

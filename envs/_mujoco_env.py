@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_e2c.envs._mujoco_config import METADATA, RobotConfig, check_render_mode
+from sb3_e2c.envs._checks import check_render_mode, require_render_mode
+from sb3_e2c.envs._mujoco_config import METADATA, RobotConfig
 from sb3_e2c.envs._mujoco_import import MujocoEnv, mujoco
 from sb3_e2c.envs._mujoco_models import STOCK_XML, build_model
 from sb3_e2c.envs._mujoco_physics import get_state, set_state, take_snapshot
-from sb3_e2c.envs._mujoco_render import HEIGHT, WIDTH, Painter, require_render_mode
+from sb3_e2c.envs._mujoco_render import HEIGHT, WIDTH, Painter
 from sb3_e2c.envs._mujoco_robots import FRAME_SKIP, new_robot
 from sb3_e2c.envs._mujoco_start import draw_start, place
 

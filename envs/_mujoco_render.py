@@ -20,15 +20,6 @@ _RED = (1.0, 0.0, 0.0, 1.0)
 _MARKED = (BOMB, "torso_geom", "torso")  # the first of these geoms that exists turns red
 
 
-def require_render_mode(render_mode: str | None) -> None:
-    """Refuse to draw without a mode."""
-    if render_mode is None:
-        raise ValueError(
-            "render() needs a render mode, found None; create the environment with "
-            "render_mode='rgb_array'"
-        )
-
-
 class Painter:
     """Draws one model; everything of OpenGL happens at the first picture.
 
@@ -62,6 +53,8 @@ class Painter:
         """Release the OpenGL context."""
         if self._renderer is not None:
             self._take_context()
+            if self._renderer.viewer is not None:
+                self._renderer.viewer.con.free()  # needs the context, which goes away next
             self._renderer.close()
             self._renderer = None
 

@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_e2c.envs._mujoco_config import METADATA, RobotConfig, check_render_mode
+from sb3_e2c.envs._checks import (
+    check_actions,
+    check_render_mode,
+    check_running,
+    require_render_mode,
+)
+from sb3_e2c.envs._mujoco_config import METADATA, RobotConfig
 from sb3_e2c.envs._mujoco_models import build_fast_model, build_model
 from sb3_e2c.envs._mujoco_physics import Physics, get_state, set_state
-from sb3_e2c.envs._mujoco_render import Painter, require_render_mode
+from sb3_e2c.envs._mujoco_render import Painter
 from sb3_e2c.envs._mujoco_robots import new_robot
 from sb3_e2c.envs._mujoco_start import draw_start, place
 from sb3_e2c.envs._mujoco_views import View
@@ -139,19 +145,8 @@ class RobotSimulator:
     def _check_step(self, actions: np.ndarray) -> None:
         n_agents = len(self.possible_agents)
         shape = (self.n_worlds, n_agents, len(self._order) // n_agents)
-        if actions.shape != shape:
-            raise ValueError(f"actions have shape {actions.shape}; expected (W, N, A) = {shape}")
-        if self._needs_reset.any():
-            raise ValueError(
-                f"step() was called although the episode of world(s) "
-                f"{np.flatnonzero(self._needs_reset).tolist()} has ended or not begun; reset first"
-            )
-        if not np.isfinite(actions).all():
-            world, agent, _ = np.argwhere(~np.isfinite(actions))[0]
-            raise ValueError(
-                f"the action of {self.possible_agents[agent]} in world {world} is "
-                f"{actions[world, agent].tolist()}; expected finite numbers"
-            )
+        check_actions(actions, shape, self.possible_agents)
+        check_running(self._needs_reset)
 
     def _for_agents(self, values: dict[str, np.ndarray]) -> Infos:
         """The numbers of worlds (W,), the same for each of their agents (W, N)."""

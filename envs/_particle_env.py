@@ -9,14 +9,13 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_e2c.envs._checks import check_render_mode, require_render_mode
 from sb3_e2c.envs._particle_config import ParticleConfig, ParticleTask, Start, place
 from sb3_e2c.envs._particle_mpe2 import new_world, picture, restart
 from sb3_e2c.envs._particle_sim import (
     ParticleSimulator,
     action_spaces,
-    check_render_mode,
     observation_spaces,
-    require_render_mode,
 )
 
 

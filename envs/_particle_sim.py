@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_e2c.envs._checks import check_render_mode, check_running, require_render_mode
 from sb3_e2c.envs._particle_config import TASKS, ParticleConfig, Start, draw_start, place
 from sb3_e2c.envs._particle_kernels import (
     Outcome,
@@ -125,11 +126,7 @@ class ParticleSimulator:
         :return: observations (W, n, D) and rewards (W, n) by group, terminated (W,), truncated
             (W,), and infos by group, "cost" (W, n); all of them fresh
         """
-        if self._needs_reset.any():
-            raise ValueError(
-                f"step() was called although the episode of world(s) "
-                f"{np.flatnonzero(self._needs_reset).tolist()} has ended or not begun; reset first"
-            )
+        check_running(self._needs_reset)
         controls = self._controls(actions)
         observations = self._empty_observations(self.n_worlds)
         shape = controls.shape[:2]
@@ -206,21 +203,6 @@ class ParticleSimulator:
 
     def close(self) -> None:
         """Nothing to release."""
-
-
-def check_render_mode(render_mode: str | None) -> None:
-    """Refuse an unknown mode."""
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-
-
-def require_render_mode(render_mode: str | None) -> None:
-    """Refuse to draw without a mode."""
-    if render_mode is None:
-        raise ValueError(
-            "render() needs a render mode, found None; create the environment with "
-            "render_mode='rgb_array'"
-        )
 
 
 def observation_spaces(config: ParticleConfig) -> dict[str, spaces.Box]:

@@ -8,6 +8,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_e2c.envs._checks import (
+    check_actions,
+    check_render_mode,
+    check_running,
+    require_render_mode,
+)
 from sb3_e2c.envs._rover_config import SENSOR_FLOOR, RoverConfig, place_pois, place_rovers
 from sb3_e2c.envs._rover_kernels import (
     SENSOR_TYPES,
@@ -46,8 +52,7 @@ class RoverSimulator:
     def __init__(self, config: RoverConfig, n_worlds: int, render_mode: str | None = None) -> None:
         if n_worlds < 1:
             raise ValueError(f"n_worlds is {n_worlds}; expected at least 1")
-        if render_mode not in (None, *METADATA["render_modes"]):
-            raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
+        check_render_mode(render_mode)
         self.config = config
         self.n_worlds = n_worlds
         self.render_mode = render_mode
@@ -156,19 +161,8 @@ class RoverSimulator:
 
     def _check_step(self, actions: np.ndarray) -> None:
         shape = (self.n_worlds, self.config.n_rovers, 2)
-        if actions.shape != shape:
-            raise ValueError(f"actions have shape {actions.shape}; expected (W, N, 2) = {shape}")
-        if self._needs_reset.any():
-            raise ValueError(
-                f"step() was called although the episode of world(s) "
-                f"{np.flatnonzero(self._needs_reset).tolist()} has ended or not begun; reset first"
-            )
-        if not np.isfinite(actions).all():
-            world, rover, _ = np.argwhere(~np.isfinite(actions))[0]
-            raise ValueError(
-                f"the action of {self.possible_agents[rover]} in world {world} is "
-                f"{actions[world, rover].tolist()}; expected two finite numbers"
-            )
+        check_actions(actions, shape, self.possible_agents)
+        check_running(self._needs_reset)
 
     def _empty_outcome(self) -> Outcome:
         shape = (self.n_worlds, self.config.n_rovers)
@@ -192,11 +186,7 @@ class RoverSimulator:
         :param world: index of the world
         :return: RGB image, uint8, shape (height, width, 3)
         """
-        if self.render_mode is None:
-            raise ValueError(
-                "render() needs a render mode, found None; create the environment with "
-                "render_mode='rgb_array'"
-            )
+        require_render_mode(self.render_mode)
         from sb3_e2c.envs._rover_render import draw_world  # Pillow is needed for pictures only
 
         return draw_world(self.config, State(*(array[world] for array in self.state)))

@@ -22,7 +22,7 @@ def parse_cost_limits(cost_limits: float | Sequence[float] | np.ndarray | None) 
     """
     try:
         limits = np.atleast_1d(np.asarray([] if cost_limits is None else cost_limits, np.float64))
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         limits = np.array([np.nan])
     if limits.ndim != 1 or np.isnan(limits).any() or (limits < 0).any():
         raise ValueError(

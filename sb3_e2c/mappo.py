@@ -63,7 +63,8 @@ class MAPPO(PPO):
 
     What an environment may put into its infos, for every agent:
 
-    - ``cost``: a number, or M numbers, in the info of every step; needed with ``cost_limits``.
+    - ``cost``: a number, or M numbers, in the info of every step; needed with ``cost_limits``, and
+      then at least 0.
     - ``critic_state``: a 1-D array, equal for all agents of a world, in the infos of every reset
       and step. Critics see it beside the joint observation, actors never do (docs/paper.md, D18).
 

@@ -76,7 +76,11 @@ def test_adapters_do_not_know_the_algorithm(module):
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [
-        ("sb3_e2c", "rl_zoo3 mujoco ray mpe2 matplotlib.pyplot"),
+        (
+            "sb3_e2c",
+            "rl_zoo3 mujoco ray mpe2 matplotlib.pyplot onnx onnxruntime huggingface_hub optuna "
+            "requests urllib3 wandb",
+        ),
         ("sb3_e2c.envs", "torch mujoco mpe2"),
     ],
 )

@@ -30,8 +30,8 @@ def reference(tmp_path_factory):
 
 @pytest.mark.parametrize("kill", crash.KILLS.values(), ids=lambda kill: kill.__name__)
 def test_a_run_that_is_killed_again_and_again_ends_like_an_undisturbed_one(kill, tmp_path):
-    tried, lost, wrong, notes = crash.kills(tmp_path, kill, n=4, rollouts=6, seed=1)
-    assert tried >= 4
+    tried, lost, wrong, notes = crash.kills(tmp_path, kill, n=2, rollouts=12, seed=1)
+    assert tried >= 2
     assert (lost, wrong, notes) == (0, 0, [])
 
 
@@ -65,11 +65,11 @@ def test_a_fault_finds_a_file_half_written(tmp_path):
 
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory):
-    return {each.fault: each for each in fuzz.torture(tmp_path_factory.mktemp("fuzz"), n=300)}
+    return {each.fault: each for each in fuzz.torture(tmp_path_factory.mktemp("fuzz"), n=80)}
 
 
 def test_whatever_is_typed_or_spoiled_works_or_is_one_clear_error(fuzzed):
-    assert sum(each.tried for each in fuzzed.values()) >= 250
+    assert sum(each.tried for each in fuzzed.values()) >= 60
     assert {each.fault: each.notes for each in fuzzed.values() if each.notes} == {}
 
 
@@ -113,15 +113,11 @@ def test_payloads_are_live_and_trust_executes_them(stranger, tmp_path):
     [
         (f"{PREY}.zip: data", "export"),
         (f"{PREY}.zip: policy.pth (zip)", "enjoy"),
-        (f"{PREY}.zip: policy.pth (legacy)", "enjoy"),
         (f"{PREY}.zip: policy.optimizer.pth (tar)", "push"),
-        (f"{PREY}.zip: more.pth (plain)", "record"),
         (f"{PREY}.adversary.zip: policy.pth (zip)", "train --opponent FILE"),
         (f"{PREY}.vecnormalize.npz: object arrays", "enjoy"),
-        (f"{PREY}.vecnormalize.npz: a pickle", "enjoy"),
         (f"{PREY}/vecnormalize.pkl", "enjoy"),
         ("resume points", "enjoy"),
-        ("config.yml: objects", "enjoy"),
         ("config.yml: callback", "plot"),
     ],
 )
@@ -132,14 +128,19 @@ def test_no_payload_is_executed(stranger, tmp_path, place, command):
     assert found[command] in ("works", "refused")
 
 
-@pytest.mark.parametrize("lie", untrusted.lies())
+LIES = ["zip slip: ../", "symbolic link in the archive", "bomb: inside the weights"]
+LIES += ["bomb: stretched arrays", "bomb: an array's claim", "bomb: merges in YAML"]
+LIES += ["bomb: a YAML that is itself", "bomb: networks"]
+
+
+@pytest.mark.parametrize("lie", LIES)
 def test_archives_and_yaml_that_lie_are_refused_in_one_line(stranger, tmp_path, lie):
     assert tried(stranger, tmp_path, untrusted.lies()[lie], "enjoy") == {"enjoy": "refused"}
 
 
 def test_a_bomb_would_be_seen(stranger, tmp_path, monkeypatch):
     monkeypatch.setattr(build, "check_archive", lambda *_: None)
-    spoil = untrusted.lies()["bomb: the weights"]
+    spoil = untrusted.lies()["bomb: inside the weights"]
     assert tried(stranger, tmp_path, spoil, "enjoy") == {"enjoy": "memory"}
 
 
@@ -149,17 +150,18 @@ def test_a_run_from_the_hub_is_unpickled_only_if_it_is_trusted(stranger, tmp_pat
     run = run_in(logs)
     untrusted._change(run / PREY / "args.yml", repo_id="somebody/prey", trust=True)
     what = run if flag == "--resume" else run / f"{PREY}.zip"
-    argv = ["--env", PREY, "-f", str(logs), flag, str(what)]
+    argv = [flag, str(what)]
+    argv += ["--env", PREY, "-f", str(logs)] if flag == "-i" else []
     with pytest.raises(SystemExit):
         train.main(argv)
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "to unpickle it, which can execute" in line
-    assert train.train([*argv, "--trust", "-n", "600", "--verbose", "0"]).exists()
+    assert train.train([*argv, "--trust", "-n", "900", "--verbose", "0"]).exists()
 
 
 # ---------------------------------------------------------------------------- soak
 
 
 def test_a_long_training_does_not_grow(tmp_path):
-    (found,) = soak.torture(tmp_path)
+    (found,) = soak.torture(tmp_path, rollouts=200)
     assert found.notes == ()

@@ -24,7 +24,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
@@ -177,6 +177,8 @@ class ProgressFile(KVWriter):
     :param path: The file
     :param n_rows: How many rows of it to keep
     """
+
+    _file: TextIO
 
     def __init__(self, path: Path, n_rows: int = 0):
         self.path = path

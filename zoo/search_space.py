@@ -138,7 +138,7 @@ class SearchSpace:
         path: Path | None = None,
     ):
         self.algo, self.config = algo, config
-        own = {} if path is None else read_yaml(path)
+        own = {} if path is None else _read_own(path)
         named = [key for key in own if own[key] is not None]
         shipped = read_yaml(FOLDER / "search_space.yml")
         kept = [key for key in shipped if not _dropped(key, own) and not _is_fixed(key, fixed)]
@@ -207,6 +207,14 @@ class SearchSpace:
     def plain(self) -> dict[str, Any]:
         """As a file for --space."""
         return {each.key: each.plain() for each in self.dimensions}
+
+
+def _read_own(path: Path) -> dict[str, Any]:
+    own = read_yaml(path)
+    for key in own:
+        if not isinstance(key, str):
+            raise UserError(f"{path}: found the key {key!r}; expected one like oem_kwargs.psi")
+    return own
 
 
 def _dropped(key: str, own: Mapping[str, Any]) -> bool:

@@ -87,6 +87,7 @@ _OF_TUNE = {
     *("--optimization-log-path", "--optimize-hyperparameters"),
 }
 _NOT_FOR_TEAMS = {*_OF_TUNE, "--save-replay-buffer", "--truncate-last-trajectory"}
+_MOST_THREADS = 1024  # torch would start them all
 _AT_LEAST = {
     "eval_episodes": 1,
     "n_eval_envs": 1,
@@ -236,6 +237,8 @@ def _check_numbers(args: argparse.Namespace) -> None:
         if getattr(args, name) < least:
             flag = f"--{name.replace('_', '-')}"
             raise UserError(f"{flag} is {getattr(args, name)}; expected at least {least}")
+    if args.num_threads > _MOST_THREADS:
+        raise UserError(f"--num-threads is {args.num_threads}; expected at most {_MOST_THREADS}")
     if args.n_timesteps != -1 and args.n_timesteps < 1:
         raise UserError(f"--n-timesteps is {args.n_timesteps}; expected at least 1")
     if not args.resume_every >= 0:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_e2c.zoo import train
-from sb3_e2c.zoo.resume import newest_point
+from sb3_e2c.zoo.resume import KeepPoints, newest_point
 from torture.runs import (
     ROVERS,
     Outcome,
@@ -258,7 +258,6 @@ def deleted(folder, how="delete", at=3):
 
     :return: None, or what is wrong
     """
-    from sb3_e2c.zoo.resume import KeepPoints
 
     def trouble():
         real, calls = KeepPoints._on_rollout_start, []
@@ -289,7 +288,13 @@ def deleted(folder, how="delete", at=3):
     return None
 
 
-_NEW_NAMESPACE, _READ_ONLY, _REMOUNT = 0x00020000, 1, 32
+_NEW_NAMESPACE, _READ_ONLY, _REMOUNT, _PRIVATE = 0x00020000, 1, 32, 1 << 18 | 1 << 14
+
+
+def _own_mounts(libc):
+    """What this process mounts from now on, no other sees."""
+    if libc.unshare(_NEW_NAMESPACE) or libc.mount(b"none", b"/", None, _PRIVATE, None):
+        raise SystemExit(77)
 
 
 def tmpfs(folder, kib):

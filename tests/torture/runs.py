@@ -67,7 +67,7 @@ def run_in(folder):
 
 def quietly(command, argv):
     """Run a command; its exit status, and what it wrote to stdout and stderr."""
-    status, out, err = 0, _console(), _console()
+    status, out, err = 0, _console("strict"), _console("backslashreplace")
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             command([str(word) for word in argv])
@@ -76,9 +76,9 @@ def quietly(command, argv):
     return status, *(_text(each) for each in (out, err))
 
 
-def _console():
-    """As strict about characters as a terminal."""
-    return io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
+def _console(errors):
+    """As strict about characters as Python's own."""
+    return io.TextIOWrapper(io.BytesIO(), "utf-8", errors, write_through=True)
 
 
 def _text(console):
@@ -117,7 +117,8 @@ def trained(folder, env=ROVERS, rollouts=5):
 
     :return: The run's folder
     """
-    return train.train(flags(folder, env, rollouts))
+    with contextlib.redirect_stdout(io.StringIO()):  # RL-Zoo's heading
+        return train.train(flags(folder, env, rollouts))
 
 
 def results(run):

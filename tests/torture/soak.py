@@ -7,7 +7,6 @@ writes soak/ENV.csv, a row every few seconds, and soak/ENV.png. Linux only: it r
 
 import argparse
 import csv
-import gc
 import os
 import signal
 import time
@@ -18,6 +17,7 @@ from matplotlib.figure import Figure
 
 from sb3_e2c import OEMRewardCallback
 from sb3_e2c.zoo import train
+from sb3_e2c.zoo.resume import KeepPoints
 from torture.runs import ROVERS, Outcome, flags, fork, wait
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -108,8 +108,6 @@ def grows(folder, rollouts=200):
         grow: of the estimator's memory in observations, of the episodes that the model keeps, and
         of resume points in number
     """
-    from sb3_e2c.zoo.resume import KeepPoints
-
     seen, real = [], KeepPoints._on_rollout_start
 
     def on_rollout_start(self):
@@ -118,7 +116,6 @@ def grows(folder, rollouts=200):
         capacity = oem.estimator._memory.columns.shape[2]
         points = len(list(self.points.run.glob("resume/*.point")))
         kept = len(self.model.ep_info_buffer)
-        gc.collect()
         seen.append((*measure(), self.points.progress.n_rows, capacity, kept, points))
 
     KeepPoints._on_rollout_start = on_rollout_start

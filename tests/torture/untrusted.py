@@ -21,8 +21,8 @@ from sb3_e2c.zoo import enjoy, export, plot, push, record, train
 from torture.runs import PREY, Outcome, fork, quietly, rollout, trained, wait
 
 PAYLOADS = ("zip", "legacy", "plain", "tar")  # how torch has saved, over the years
-BOMB = 2**30  # bytes; a file of the run has some kilobytes
-MEMORY = 2**29  # bytes more than before that a command may take to refuse one
+BOMB = 2**28  # bytes; a file of the run has some kilobytes
+MEMORY = 2**27  # bytes more than before that a command may take to refuse one
 SECONDS = 60.0  # this machine may be busy
 
 
@@ -53,9 +53,11 @@ def commands(logs, out):
         "plot": (plot.main, [run, "-o", out / "a.png"]),
         "train --opponent FILE": (
             train.main,
-            ["--env", PREY, "-f", out / "logs", "--opponent", zips[0], "--n-eval-envs", "1"]
-            + ["-n", str(rollout(PREY)), "--eval-freq", "-1", "--verbose", "0", "-params"]
-            + ["n_envs:2", "n_steps:20", "n_epochs:1", "policy_kwargs.net_arch:[8]"],
+            [
+                *("--env", PREY, "-f", out / "logs", "--opponent", zips[0], "--eval-freq", "-1"),
+                *("-n", str(rollout(PREY)), "--n-eval-envs", "1", "--verbose", "0"),
+                *("-params", "n_envs:2", "n_steps:20", "n_epochs:1", "policy_kwargs.net_arch:[8]"),
+            ],
         ),
     }
 
@@ -125,7 +127,7 @@ def poisons(run, payload):
         name = path.relative_to(run)
         yield f"{name}", lambda r, n=name: (r / n).write_bytes(pickled(payload, "plain"))
     yield "resume points", lambda r: _points(r, payload)
-    code = f"!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{{}}']]"
+    code = "!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{}']]"
     for name in ("config.yml", "args.yml"):
         text = code.format(payload.trace)
         yield f"{name}: objects", lambda r, n=name, t=text: _append(r / PREY / n, f"\nn_envs: {t}")
@@ -208,10 +210,9 @@ def _link(archive):
 
 
 def _bomb(archive, name):
-    rewrite(archive, name, b"") if name in zipfile.ZipFile(archive).namelist() else None
     with zipfile.ZipFile(archive) as file:
         members = {each: file.read(each) for each in file.namelist() if each != name}
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         for each, data in members.items():
             file.writestr(each, data)
         _pour(file, name)
@@ -227,7 +228,7 @@ def _inner_bomb(old):
     file = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(old)) as before:
         names = before.namelist()
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as after:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as after:
             for name in names:
                 if name.endswith("data/0"):
                     _pour(after, name)
@@ -348,19 +349,30 @@ _READ_BY = {
 }
 
 
-def readers(place, every):
+def readers(place):
     """Commands to try."""
     for start, names in _READ_BY.items():
-        if place.startswith(start) and not every:
+        if place.startswith(start):
             return names
-    return list(commands(Path(), Path())) if every else ["enjoy", "export"]
+    return ["enjoy", "export"]
+
+
+def _everywhere(spoils):
+    """Poisons whatever can be without being refused for its form."""
+
+    def spoil(run):
+        for place, each in spoils.items():
+            if place.endswith(("data", ".pkl", "points", "callback", "more.pth (zip)")):
+                each(run)
+
+    return spoil
 
 
 def torture(work, every=True):
     """Try payloads and lies.
 
     :param work: An empty folder
-    :param every: Whether every command is tried on everything
+    :param every: Whether payloads are tried in every format that torch has had
     :return: Two lines of the table
     """
     logs, trace = work / "logs", work / "executed"
@@ -368,19 +380,17 @@ def torture(work, every=True):
     control(logs, work)
     spoils = dict(poisons(run, Payload(trace)))
     if not every:
-        spoils = {name: spoils[name] for name in list(spoils) if "(" not in name or "(zip" in name}
-    yield _outcome("payloads", logs, spoils, trace, work, every, "works", "refused")
-    harmless = ["train --opponent FILE", "plot", "enjoy --load-best", "record"]
-    harmless += ["enjoy --load-last-checkpoint", "enjoy --opponent FILE"]
-    yield _outcome("zip slips and bombs", logs, lies(), trace, work, False, "refused")
-    yield from ()
+        spoils = {name: spoils[name] for name in spoils if "(" not in name or "(zip" in name}
+    tried = {(place, spoil): readers(place) for place, spoil in spoils.items()}
+    tried["everywhere", _everywhere(spoils)] = list(commands(logs, work))
+    yield _outcome("payloads in pickled places", logs, tried, trace, work, "works", "refused")
+    tried = {each: ["enjoy", "export"] for each in lies().items()}
+    yield _outcome("zip slips, bombs of zip and YAML", logs, tried, trace, work, "refused")
 
 
-def _outcome(fault, logs, spoils, trace, work, every, *fine):
+def _outcome(fault, logs, tries, trace, work, *fine):
     tried, wrong = 0, []
-    for place, spoil in spoils.items():
-        names = readers(place, every)
-        names = ["enjoy", "export"] if fine == ("refused",) else names
+    for (place, spoil), names in tries.items():
         for name, found in attempt(logs, spoil, names, trace, work).items():
             tried += 1
             if found not in fine:
