@@ -6,7 +6,7 @@ its own neighbor; ``o_0`` is not scored and therefore not stored. ``callbacks`` 
 into a reward (lines 11-17). ``S`` slots, ``D`` numbers per observation.
 """
 
-import math
+import sys
 from numbers import Integral, Real
 from typing import Any, Protocol, runtime_checkable
 
@@ -335,6 +335,7 @@ def _positive_integer(name: str, value: Any) -> int:
 
 
 def _finite_number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+    largest = sys.float_info.max  # whole numbers can be larger
+    if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) <= largest:
         raise ValueError(f"{name} must be a finite number, got {value!r}.")
     return float(value)

@@ -12,6 +12,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+_LARGEST = float(th.finfo(th.float32).max)
+
 
 class Multipliers(nn.Module, ABC):
     """What the algorithm needs to know; write your own by subclassing.
@@ -124,7 +126,7 @@ def _times(gain: float, violation: th.Tensor) -> th.Tensor:
 
 def _check(initial: float, maximum: float, **gains: float) -> None:
     for name, value in {"initial": initial, "maximum": maximum, **gains}.items():
-        if not isinstance(value, Real) or not value >= 0:
+        if not isinstance(value, Real) or not value >= 0 or _LARGEST < value < math.inf:
             raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")
     if not math.isfinite(initial) or initial > maximum:
         raise ValueError(

@@ -349,7 +349,11 @@ class OpponentVecEnv(MultiAgentVecEnv):
         acting: Opponents
         if isinstance(opponent, str):
             if opponent != "random" or learning:
-                kind = "a model that learns" if learning else "'random' or a model"
+                kind = (
+                    "a model that learns"
+                    if learning
+                    else "'random' or a model, such as MAPPO.load('team.adversary.zip')"
+                )
                 raise ValueError(f"opponent is {opponent!r}; expected {kind}")
             acting = RandomOpponents(self.opponents, self.n_worlds)
         elif not hasattr(opponent, "predict"):
@@ -438,7 +442,7 @@ def _check_request(
             "lambda: multi_rover_v0.parallel_env(n_rovers=6)"
         )
     for name, number in (("n_worlds", n_worlds), ("n_processes", n_processes)):
-        if not isinstance(number, Integral):
+        if isinstance(number, bool) or not isinstance(number, Integral):
             raise TypeError(f"{name} is {number!r}; expected a whole number")
     if seed is not None and (not isinstance(seed, Integral) or seed < 0):
         raise ValueError(f"seed is {seed!r}; expected a whole number of at least 0, or None")

@@ -628,3 +628,10 @@ def test_actor_and_critics_may_have_features_extractors_of_their_own(policy):
     model = MAPPO(policy, env, n_steps=8, batch_size=16, n_epochs=1, policy_kwargs=kwargs)
     model.learn(32)
     assert model.num_timesteps == 32
+
+
+def test_a_team_that_learns_from_a_bonus_is_not_loaded_without_it(tmp_path):
+    env = share_parameters(TwoOnALine, n_worlds=2)
+    E2CMAPPO("MlpPolicy", env, n_steps=8, batch_size=16).save(tmp_path / "team")
+    with pytest.raises(ValueError, match=r"load it with E2CMAPPO\.load"):
+        MAPPO.load(tmp_path / "team")

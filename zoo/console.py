@@ -58,6 +58,9 @@ def one_line_errors() -> Iterator[None]:
         yield
     except (UserError, OSError) as error:
         fail(error)
+    except KeyboardInterrupt:
+        print("sb3-e2c: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 class ConsoleParser(argparse.ArgumentParser):

@@ -258,6 +258,8 @@ def _evaluate(model: MAPPO, env: VecEnv, args: argparse.Namespace) -> TeamEvalua
 
 def _film(run: Run, model: MAPPO, args: argparse.Namespace) -> None:
     kwargs = {**(args.env_kwargs or {}), "render_mode": "rgb_array"}
+    if args.verbose > 0:
+        print(f"Filming one episode to {args.video}; long ones take minutes", flush=True)
     with closing(make_env(run, 1, args.seed, kwargs, args.trust)) as env:
         choose_opponent(run, model, env, args.opponent[0], args.deterministic_opponent)
         record_episode(model, env, args.video, args.deterministic)

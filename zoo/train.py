@@ -228,8 +228,8 @@ def _import_packages(names: Sequence[str]) -> None:
     for name in names:
         try:
             importlib.import_module(name)
-        except ImportError as error:
-            raise UserError(f"--gym-packages {name}: {error}") from error
+        except (ImportError, TypeError, ValueError) as error:  # also for a name that is none
+            raise UserError(f"--gym-packages {name!r}: {error}") from error
 
 
 def _check_numbers(args: argparse.Namespace) -> None:

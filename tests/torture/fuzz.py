@@ -186,9 +186,9 @@ pairs = st.builds("{}:{}".format, dotted, st.sampled_from(VALUES) | words) | wor
 def argv_of(parser):
     """Command lines of a parser: its flags with values that fit more or less."""
     flags = [a for a in parser._actions if not isinstance(a, argparse._HelpAction)]
-    return st.lists(st.one_of([_flag(each) for each in flags] + [words.map(lambda w: [w])])).map(
-        lambda parts: [word for part in parts for word in part]
-    )
+    part = st.one_of([_flag(each) for each in flags] + [words.map(lambda word: [word])])
+    few = st.lists(st.one_of([_flag(each) for each in flags]), max_size=2)
+    return (few | st.lists(part)).map(lambda parts: [word for part in parts for word in part])
 
 
 def _flag(action):
