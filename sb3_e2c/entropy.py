@@ -336,6 +336,6 @@ def _positive_integer(name: str, value: Any) -> int:
 
 def _finite_number(name: str, value: Any) -> float:
     largest = sys.float_info.max  # whole numbers can be larger
-    if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) <= largest:
+    if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) <= largest:  # type: ignore[operator]
         raise ValueError(f"{name} must be a finite number, got {value!r}.")
     return float(value)

@@ -765,8 +765,8 @@ class MAPPO(PPO):
         model = super().load(path, env, **kwargs)
         if hasattr(model, "oem_kwargs") and not hasattr(model, "_oem_callback"):
             raise ValueError(
-                f"{path} holds a team that learns from an entropy bonus, which {cls.__name__} would "
-                "leave out; load it with E2CMAPPO.load"
+                f"{path} holds a team that learns from an entropy bonus, which {cls.__name__} "
+                "would leave out; load it with E2CMAPPO.load"
             )
         in_a_file = isinstance(path, (str, pathlib.Path))
         beside = adversary_path(path) if in_a_file else pathlib.Path("an open file")
