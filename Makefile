@@ -1,5 +1,6 @@
 # make train   install everything and train E2C-MAPPO (T) on the multi-rover task
 # make test    install everything and run the tests
+# make torture kill, starve, fuzz and deceive it, and print what survived (4 minutes)
 # Every other target installs first, too; a second call installs nothing.
 
 PYTHON ?= python3
@@ -8,13 +9,16 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SOURCES := sb3_e2c/*.py envs zoo tests
 
-.PHONY: train test pytest format lint type check-codestyle commit-checks clean
+.PHONY: train test pytest torture format lint type check-codestyle commit-checks clean
 
 train: $(INSTALLED)
 	$(BIN)/python -m sb3_e2c.zoo.demo
 
 test pytest: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2
+
+torture: $(INSTALLED)
+	PYTHONPATH=tests timeout 600 $(BIN)/python -m torture
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix $(SOURCES)
