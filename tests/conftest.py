@@ -1,5 +1,7 @@
 """One environment that can be computed by hand, used by all tests that need one."""
 
+import signal
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +13,10 @@ from pettingzoo import ParallelEnv
 
 # Tests run side by side; threads that wait for each other would only slow them down.
 th.set_num_threads(1)
+
+# Shells start background jobs with Ctrl-C ignored, and so do their children; some tests send it.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SLOW, FAST = 0, 1
 AGENTS = ["agent_0", "agent_1"]

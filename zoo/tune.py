@@ -237,6 +237,8 @@ class Search:
             seconds = trial.duration.total_seconds() if trial.duration else 0.0
             print(f"{trial_in_words(trial, self._model_limits)} ({seconds:.0f} s)", flush=True)
         self.write(study)
+        if trial.state is TrialState.FAIL:  # else it would be done again for ever
+            raise UserError(f"trial {trial.number} ended without a number for its return")
 
     def write(self, study: optuna.Study) -> None:
         """Write trials.csv, and best.yml if there is a best trial.
