@@ -449,7 +449,6 @@ class MAPPO(PPO):
             episode_starts=self._last_episode_starts,  # type: ignore[arg-type]
             actions=actions,
             rewards=rewards,
-            new_obs=new_obs,
             dones=dones,
             infos=infos,
             reset_infos=reset_infos,

@@ -216,6 +216,7 @@ class LearningOpponents(Opponents):
             return
         model.num_timesteps += len(dones)
         rewards = model.reward_scale * step.rewards
+        model.check(step.observations, rewards, infos=())
         model.record(self._actions, rewards, step.observations, dones, step.infos, step.infos)
         self._collecting = not model.rollout_buffer.full
 

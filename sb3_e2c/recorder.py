@@ -78,26 +78,24 @@ class TeamRecorder:
         episode_starts: np.ndarray,
         actions: np.ndarray,
         rewards: np.ndarray,
-        new_obs: np.ndarray,
         dones: np.ndarray,
         infos: Infos,
         reset_infos: Infos,
     ) -> None:
-        """Store one step of all slots.
+        """Store one step of all slots, which :meth:`check` has seen.
 
         :param buffer: Where to
         :param last_obs: Observations before the step, shape (S, D)
         :param episode_starts: Whether they began an episode, shape (S,)
         :param actions: Shape (S, A)
         :param rewards: Shape (S,)
-        :param new_obs: Observations after the step, shape (S, D)
         :param dones: Whether the step ended an episode, shape (S,)
         :param infos: One dict for each slot
         :param reset_infos: One dict for each slot, new where an episode ended
         """
         ended = dones[:: self.n_agents]
         when = _at(buffer.pos)
-        check_finite(self.agents, when, observation=new_obs, reward=rewards)
+        check_finite(self.agents, when, reward=rewards)  # a callback may have replaced them
         agent_costs = self._agent_costs(infos, when)
         costs = party_costs(agent_costs, self.cost_scope, self.team_cost)
         critic_states = self._critic_states(infos, when)

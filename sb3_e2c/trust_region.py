@@ -29,7 +29,7 @@ from sb3_e2c.constraints import party_costs, read_costs
 from sb3_e2c.mappo import MAPPO
 from sb3_e2c.monitor import named_costs
 from sb3_e2c.policies import TeamPolicy
-from sb3_e2c.sequences import Memory, Sequences, cut_at_ends, initial_memory, packed_rows
+from sb3_e2c.sequences import Memory, Sequences, cut_at_ends
 
 
 class Signal(NamedTuple):
@@ -465,10 +465,8 @@ def team_rows(
     """
     if initial is None:
         return None, None
-    cut = cut_at_ends(buffer.dones)
-    rows, batch_sizes = packed_rows(cut, buffer.n_worlds)
-    sequences = Sequences(th.from_numpy(batch_sizes), initial_memory(cut, initial))
-    return th.from_numpy(rows), sequences
+    rows, sequences = buffer._pack(cut_at_ends(buffer.dones), initial)
+    return rows.cpu(), sequences
 
 
 def in_order(values: np.ndarray, rows: th.Tensor | None) -> np.ndarray:

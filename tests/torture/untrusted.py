@@ -171,7 +171,7 @@ def lies():
     weights, statistics = f"{PREY}.zip", f"{PREY}.vecnormalize.npz"
     return {
         "zip slip: ../": lambda r: _add(r / weights, "../../slipped.pth"),
-        "zip slip: absolute": lambda r: _add(r / weights, "/tmp/slipped.pth"),
+        "zip slip: absolute": lambda r: _add(r / weights, "/slipped.pth"),
         "zip slip: backslashes": lambda r: _add(r / weights, "..\\slipped"),
         "symbolic link in the archive": lambda r: _link(r / weights),
         "bomb: a member": lambda r: _bomb(r / weights, "more.pth"),
