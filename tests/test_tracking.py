@@ -1,5 +1,6 @@
 """What reaches the dashboards: TensorBoard's files, and Weights & Biases through RL-Zoo's flags."""
 
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -121,7 +122,11 @@ def test_weights_and_biases_gets_settings_and_every_number(wandb):
     assert (run / ENV / "args.yml").is_file()
 
 
-def test_tracking_without_the_package_is_one_line(tmp_path, capsys):
+def test_tracking_without_the_package_is_one_line(tmp_path, capsys, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *_: None if name == "wandb" else find(name, *_)
+    )
     with pytest.raises(SystemExit) as exit_:
         train.main(["--track", "-f", str(tmp_path)])
     assert exit_.value.code == 2
