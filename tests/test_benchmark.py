@@ -24,7 +24,7 @@ from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import UserError
 from sb3_e2c.zoo.jobs import BUSY, INTERRUPTED, train_flags
 from sb3_e2c.zoo.results import Place, find_results, learning_curve, read_json, write_json
-from sb3_e2c.zoo.suite import Job, find_suite, read_suite, suite_names
+from sb3_e2c.zoo.suite import Job, find_suite, read_suite, suite_names, suite_text
 
 ENV = "MultiRover-6-3-v0"
 ROLLOUT = 2 * 6 * 80  # agent steps of two worlds of six rovers
@@ -139,10 +139,29 @@ def test_the_suite_of_the_paper_has_the_experiments_of_the_figure(key):
             assert team_limits(env, {}) == [limit]
 
 
+def test_the_paper_without_memory_is_the_paper_with_other_networks():
+    paper, mlp = (read_suite(find_suite(name)) for name in ("paper", "paper_mlp"))
+    assert mlp.experiments == paper.experiments
+    assert paper.methods["c_mappo-literal"].preset == "gru,lambda_1,literal_dual"
+    assert mlp.methods["c_mappo-literal"].preset == "headline,lambda_1,literal_dual"
+
+
+def test_results_keep_a_suite_that_needs_no_other_file(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text("base: smoke\nseeds: 7\n")
+    kept = tmp_path / "kept.yml"
+    kept.write_text(suite_text(path))
+    assert "base" not in kept.read_text()
+    assert read_suite(kept, "mine") == read_suite(path)
+    assert read_suite(path).seeds == tuple(range(7))
+    assert read_suite(path).experiments == read_suite(find_suite("smoke")).experiments
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ("seeds: 2", "sedes: 2", "did you mean 'seeds'"),
+        ("seeds: 2", "base: papr", "did you mean 'paper'"),
         ("seeds: 2", "seeds: [0, -1]", "expected how many, or a list"),
         ("window: 2", "window: 0", "expected at least 1"),
         ("window: 2", "window: two", "expected int"),

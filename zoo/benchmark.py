@@ -36,7 +36,7 @@ from sb3_e2c.zoo.console import (
 from sb3_e2c.zoo.jobs import BUSY, Outcome
 from sb3_e2c.zoo.pools import LocalPool, Pool, RayPool
 from sb3_e2c.zoo.results import Place, read_json
-from sb3_e2c.zoo.suite import Job, find_suite, read_suite, suite_names
+from sb3_e2c.zoo.suite import Job, find_suite, read_suite, suite_names, suite_text
 
 _LOOK_EVERY = 1.0  # seconds
 _PRINT_EVERY = 60.0  # seconds between lines where lines cannot be overwritten
@@ -352,7 +352,7 @@ def benchmark(args: argparse.Namespace) -> list[Outcome]:
     if args.dry_run:
         print("\n".join(describe(lengths, refused)))
         return []
-    write_whole(args.folder / "results" / suite.name / "suite.yml", path.read_text())
+    write_whole(args.folder / "results" / suite.name / "suite.yml", suite_text(path))
     for outcome in refused:
         jobs.record_failure(outcome.place, outcome.status, [outcome.message])
     progress = Progress(lengths, failed=list(refused))

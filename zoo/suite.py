@@ -11,12 +11,15 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from sb3_e2c.zoo.configuration import check_algo, parse_presets, read_yaml, resolve
+import yaml
+
+from sb3_e2c.zoo.configuration import check_algo, merge, parse_presets, read_yaml, resolve
 from sb3_e2c.zoo.console import UserError, unknown
 
 FOLDER = Path(__file__).parent / "suites"
 # Keys of a suite file with the types of their values
 _SUITE: dict[str, type | tuple[type, ...]] = {
+    "base": str,
     "title": str,
     "seeds": (int, list),
     "window": int,
@@ -45,7 +48,7 @@ class Method:
     :param label: Its key in the suite, and its folder
     :param name: For people
     :param algo: A key of ``ALGORITHMS``
-    :param preset: As for ``train --preset``
+    :param preset: As for ``train --preset``: the suite's, then its own
     :param params: As for ``train -params``
     :param env_kwargs: As for ``train --env-kwargs``
     """
@@ -205,8 +208,7 @@ def read_suite(path: Path, name: str | None = None) -> Suite:
     """
     name = path.stem if name is None else name
     _check_name(path, "name of the file", name)
-    content = read_yaml(path)
-    _check_keys(path, "", content, _SUITE, required=("methods", "experiments"))
+    content = _read_content(path)
     for key in ("window", "eval_episodes", "n_timesteps"):
         _check_positive(path, key, content)
     methods = {
@@ -223,6 +225,31 @@ def read_suite(path: Path, name: str | None = None) -> Suite:
     return Suite(name, content.get("title", name), seeds, methods, experiments, **counts)
 
 
+def suite_text(path: Path) -> str:
+    """The content of a suite file that needs no other file.
+
+    :param path: The file
+    :raises UserError: for keys that cannot be meant
+    """
+    if "base" not in read_yaml(path):
+        return path.read_text()
+    return yaml.safe_dump(_read_content(path), sort_keys=False, allow_unicode=True)
+
+
+def _read_content(path: Path) -> dict[str, Any]:
+    """A suite file over the shipped one that it names as its base."""
+    content = read_yaml(path)
+    _check_keys(path, "", content, _SUITE)
+    base = content.pop("base", None)
+    if base is not None:
+        if base not in suite_names() or base == path.stem:
+            others = [name for name in suite_names() if name != path.stem]
+            raise UserError(f"{path}: {unknown('suite (base)', base, others)}")
+        content = merge(_read_content(FOLDER / f"{base}.yml"), content)
+    _check_keys(path, "", content, _SUITE, required=("methods", "experiments"))
+    return content
+
+
 def _seeds(path: Path, value: Any) -> tuple[int, ...]:
     seeds = tuple(value) if isinstance(value, list) else tuple(range(value))
     if not seeds or any(type(seed) is not int or seed < 0 for seed in seeds):
@@ -234,7 +261,9 @@ def _read_method(path: Path, label: str, entry: Any, preset: str) -> Method:
     where = f"methods.{label}"
     _check_name(path, "label of the method", label)
     _check_keys(path, f"{where}.", entry, _METHOD)
-    method = Method(**{"label": label, "name": label, "algo": label, "preset": preset, **entry})
+    presets = ",".join([preset, *([entry["preset"]] if "preset" in entry else [])])
+    names = {"label": label, "name": label, "algo": label}
+    method = Method(**{**names, **entry, "preset": presets})
     try:
         check_algo(method.algo)
         parse_presets(method.preset)
