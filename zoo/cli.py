@@ -15,6 +15,7 @@ COMMANDS = {
     "load": "fetch a team from the Hugging Face hub",
     "demo": "train, evaluate and film one team in a few minutes",
     "benchmark": "run the experiments of a suite, on one machine or many",
+    "crossplay": "play the teams of a benchmark against each other's adversaries",
     "plot": "draw the curves of a run, or the figures of a benchmark",
     "tune": "search for hyperparameters",
     "speed": "train beside other libraries and compare the speed",

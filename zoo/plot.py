@@ -33,10 +33,11 @@ from sb3_e2c.zoo.report import (
     markdown_table,
     png,
     readable_comparisons,
+    readable_crossplay,
     readable_summary,
     summary_table,
 )
-from sb3_e2c.zoo.results import MODES, Result, final_numbers, find_results
+from sb3_e2c.zoo.results import CROSSPLAY, MODES, Result, final_numbers, find_results, read_table
 from sb3_e2c.zoo.suite import Experiment, Suite, read_suite
 
 
@@ -71,10 +72,12 @@ class Data:
 
     :param suite: The suite
     :param results: See :func:`find_results`
+    :param crossplay: See ``sb3_e2c.zoo.crossplay``; None if nobody has played
     """
 
     suite: Suite
     results: Sequence[Result]
+    crossplay: pd.DataFrame | None = None
 
     def groups(self) -> Groups:
         """Results by environment and label."""
@@ -109,7 +112,8 @@ def plot_suite(folder: Path, out: Path) -> Path:
     :return: The report
     """
     suite = read_suite(folder / "suite.yml", folder.name)
-    data = Data(suite, _of_suite(suite, find_results(folder)))
+    crossplay = read_table(folder / CROSSPLAY) if (folder / CROSSPLAY).is_file() else None
+    data = Data(suite, _of_suite(suite, find_results(folder)), crossplay)
     finals = final_numbers(data.results)
     summary = summary_table(finals, data.groups())
     comparisons = [comparison_table(each, finals) for each in suite.experiments]
@@ -125,7 +129,7 @@ def plot_suite(folder: Path, out: Path) -> Path:
         heading = f"{experiment.figure}: {experiment.title}"
         page += [html_text("h2", heading), *pictures]
         text += [f"\n## {heading}"]
-        for title, table in _tables(experiment, data.suite, summary, tests):
+        for title, table in _tables(experiment, data, summary, tests):
             page += [html_text("h3", title), html_table(table)]
             text += [f"\n### {title}\n", markdown_table(table)]
     notes = how_to_read([len(runs) for _, runs in finals.groupby(["env", "label", "mode"])])
@@ -176,17 +180,22 @@ def _pictures(experiment: Experiment, data: Data, finals: pd.DataFrame, out: Pat
 
 
 def _tables(
-    experiment: Experiment, suite: Suite, summary: pd.DataFrame, comparisons: pd.DataFrame
+    experiment: Experiment, data: Data, summary: pd.DataFrame, comparisons: pd.DataFrame
 ) -> list[tuple[str, pd.DataFrame]]:
     if summary.empty:
         return []
     tables = [
-        (f"After training, {mode} actions", readable_summary(experiment, summary, suite, mode))
+        (f"After training, {mode} actions", readable_summary(experiment, summary, data.suite, mode))
         for mode in MODES
     ]
     if not comparisons.empty:
         title = "Against the baselines, sampled actions"
-        tables.append((title, readable_comparisons(comparisons, suite)))
+        tables.append((title, readable_comparisons(comparisons, data.suite)))
+    if data.crossplay is not None:
+        table = readable_crossplay(experiment, data.crossplay, data.suite)
+        if not table.empty:
+            title = "Own adversary, random actions, and adversaries of other runs (pool)"
+            tables.append((title, table))
     return tables
 
 

@@ -193,6 +193,34 @@ def readable_comparisons(comparisons: pd.DataFrame, suite: Suite) -> pd.DataFram
     return pd.DataFrame(rows)
 
 
+def readable_crossplay(
+    experiment: Experiment, crossplay: pd.DataFrame, suite: Suite
+) -> pd.DataFrame:
+    """Return and cost of each method against the same opponents, ± standard error over seeds.
+
+    :param experiment: The experiment
+    :param crossplay: See ``sb3_e2c.zoo.crossplay``
+    :param suite: Knows the names of methods
+    """
+    groups = dict(iter(crossplay.groupby(["env", "label"])))
+    wanted = [key for key in product(experiment.envs, experiment.methods) if key in groups]
+    return pd.DataFrame([_crossplay_row(groups[key], suite) for key in wanted])
+
+
+def _crossplay_row(rows: pd.DataFrame, suite: Suite) -> dict[str, str]:
+    first = rows.iloc[0]
+    cells = {"task": str(first["env"]), "method": suite.methods[str(first["label"])].name}
+    cells["seeds"] = str(rows["seed"].nunique())
+    kinds = rows["opponent"].where(rows["opponent"].isin(["own", "random"]), "pool")
+    seeds = rows.groupby([kinds, "seed"])[measures(rows)].mean()  # all of the pool together
+    for kind in [kind for kind in ("own", "random", "pool") if kind in seeds.index]:
+        for name in measures(rows):
+            values = seeds.loc[kind, name].to_numpy(float)
+            error = float(mean_and_error(values)[1]) if len(values) > 1 else np.nan
+            cells[f"{name}, {kind}"] = plus_minus(float(values.mean()), error, 1)
+    return cells
+
+
 def number(value: float, digits: int | None) -> str:
     """A rounded number; a dash for none.
 

@@ -7,11 +7,12 @@ They are all that ``plot`` needs, and small enough to be committed::
     FOLDER/results/SUITE/ENV/METHOD/seed_SEED/evaluation.json  what enjoy --json writes
     FOLDER/results/SUITE/ENV/METHOD/seed_SEED/run.json         settings, versions; written last
     FOLDER/results/SUITE/ENV/METHOD/seed_SEED/failure.json     instead, if the job failed
+    FOLDER/results/SUITE/crossplay.csv                         what crossplay adds
     FOLDER/runs/SUITE/ENV/METHOD/seed_SEED/                    logs and models, as train writes them
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from sb3_e2c.zoo.console import UserError, write_whole
 from sb3_e2c.zoo.suite import Job
 
 MODES = ("sampled", "deterministic")
+CROSSPLAY = "crossplay.csv"
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,7 @@ def final_numbers(results: Sequence[Result]) -> pd.DataFrame:
     """
     rows = [
         {"env": result.env, "label": result.label, "seed": result.seed, "mode": mode}
-        | _numbers(result.evaluation[mode])
+        | evaluation_numbers(result.evaluation[mode])
         for result in results
         if result.evaluation is not None
         for mode in MODES
@@ -270,7 +272,12 @@ def final_numbers(results: Sequence[Result]) -> pd.DataFrame:
     return table
 
 
-def _numbers(evaluation: dict[str, Any]) -> dict[str, float]:
+def evaluation_numbers(evaluation: Mapping[str, Any]) -> dict[str, float]:
+    """What ``enjoy`` reports, as columns.
+
+    :param evaluation: See :func:`sb3_e2c.zoo.enjoy.summarize`
+    :return: ``return, violation, lambda, cost, limit`` (``cost_0``, ... if there are several)
+    """
     numbers = {
         "return": evaluation["team_return"],
         "violation": evaluation["violation_rate"],

@@ -1,0 +1,97 @@
+"""Teams of a benchmark against each other's adversaries."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_e2c.zoo import benchmark, cli, crossplay, plot
+from sb3_e2c.zoo.report import readable_crossplay
+from sb3_e2c.zoo.suite import read_suite
+
+ENV = "KeepAway-v0"
+TINY = f"""
+seeds: 2
+window: 2
+eval_episodes: 2
+n_timesteps: 480
+methods:
+  mappo: {{params: &small {{n_envs: 2, n_epochs: 1, policy_kwargs: {{net_arch: [8]}}}}}}
+  c_mappo: {{params: *small}}
+experiments:
+  one: {{envs: [{ENV}], methods: [c_mappo, mappo], baselines: [mappo]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A benchmark of two methods with two seeds, played with 4 episodes for each opponent."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    (folder / "tiny.yml").write_text(TINY)
+    run = ["--suite", str(folder / "tiny.yml"), "-f", str(folder / "out")]
+    benchmark.main([*run, "--jobs", "2"])
+    flags = [*run, "--n-episodes", "4", "--pool-seeds", "0", "1"]
+    crossplay.main(flags)
+    return folder, flags, folder / "out/results/tiny/crossplay.csv"
+
+
+def test_each_team_meets_everybody_but_itself(played):
+    table = pd.read_csv(played[2])
+    for label, seed, met in (
+        ("mappo", 0, {"own", "random", "mappo/seed_1"}),
+        ("c_mappo", 1, {"own", "random", "mappo/seed_0", "mappo/seed_1"}),
+    ):
+        rows = table[(table["label"] == label) & (table["seed"] == seed)]
+        assert set(rows["opponent"]) == met
+        assert len(rows) == len(met)
+    assert (table["episodes"] == 4).all()
+    assert np.isfinite(table[["return", "cost"]].to_numpy()).all()
+    mine = table[(table["label"] == "mappo") & (table["seed"] == 1)]
+    assert mine["return"].nunique() == len(mine)  # other opponents, other episodes
+
+
+def test_what_has_been_played_is_not_played_again(played, monkeypatch):
+    _, flags, path = played
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(rows[:-1]) + "\n")
+    calls = []
+    monkeypatch.setattr(
+        crossplay, "play", lambda *a, play=crossplay.play: calls.append(a) or play(*a)
+    )
+    crossplay.main(flags)
+    (call,) = calls
+    assert len(call[1]) == 1
+    assert path.read_text().splitlines() == rows  # the same episodes again
+
+
+def test_the_report_shows_it(played):
+    report = plot.plot_suite(played[2].parent, played[0] / "plots")
+    assert "adversaries of other runs (pool)" in report.read_text()
+
+
+def test_the_pool_counts_as_one_opponent_of_each_seed(played):
+    suite = read_suite(played[0] / "tiny.yml")
+    rows = [(0, "own", 9), (0, "a", 1), (0, "b", 3), (1, "own", 9), (1, "a", 5), (1, "b", 7)]
+    table = pd.DataFrame(rows, columns=["seed", "opponent", "return"])
+    table = table.assign(env=ENV, label="mappo")
+    (row,) = readable_crossplay(suite.experiments[0], table, suite).to_dict("records")
+    assert row["return, own"] == "9.0 ± 0.0"
+    assert row["return, pool"] == "4.0 ± 2.0"  # seeds 2 and 6
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--pool", "mapo"], "did you mean 'mappo'"),
+        (["--pool-seeds", "7"], "no finished runs of mappo"),
+        (["--pool-seeds", "x"], "expected numbers such as"),
+        (["--n-episodes", "0"], "expected at least 1"),
+    ],
+)
+def test_a_mistake_is_one_line(played, capsys, flags, words):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["crossplay", *played[1], *flags])
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert words in line
