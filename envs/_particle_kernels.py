@@ -1,7 +1,8 @@
-"""The particle tasks, compiled: one pass over all worlds per step, equal to mpe2's.
+"""The particle tasks, compiled: one pass over all worlds for each part of a step, equal to mpe2's.
 
-``W`` worlds, ``A`` agents, ``E`` entities (agents, then landmarks). The order inside one step is
-mpe2's: contact forces, positions, velocities, then rewards, costs and observations.
+``W`` worlds, ``A`` agents, ``E`` entities (agents, then landmarks), ``K`` landmarks. The order
+inside one step is mpe2's: contact forces, positions, velocities, then rewards, costs and
+observations. What differs between the tasks stands in tables of :class:`Rules`.
 """
 
 from __future__ import annotations
@@ -22,16 +23,25 @@ _compiled = njit(cache=True, error_model="numpy")
 
 
 class Rules(NamedTuple):
-    """The part of a ``ParticleConfig`` that the compiled code reads."""
+    """What the compiled code knows of a task and its parameters.
+
+    A pair of entities has an agent first, and beside it the distance at which the two touch.
+    """
 
     task: int  # index in TASKS
     max_cycles: int
     is_team: np.ndarray  # (A,) bool
-    sizes: np.ndarray  # (E,)
-    collides: np.ndarray  # (E,) bool
     max_speeds: np.ndarray  # (A,)
-    counted: np.ndarray  # (A, E) bool, whose contact costs
-    views: np.ndarray  # (2, 5) bool, fields of View for opponents and team
+    pushing: np.ndarray  # (P, 2) pairs that push each other, every pair once
+    pushing_at: np.ndarray  # (P,)
+    counted: np.ndarray  # (C, 2) contact with the second costs the first
+    counted_at: np.ndarray  # (C,)
+    catching: np.ndarray  # (F, 2) of an opponent and an agent of the team
+    catching_at: np.ndarray  # (F,)
+    goal_colors: np.ndarray  # (K, 3) color of the team for every goal
+    numbers: np.ndarray  # of a world, see _particle_views; here without those that change
+    team: np.ndarray  # (2, team · D) which numbers are observed, minus which
+    opponents: np.ndarray  # (2, opponents · D)
 
 
 class State(NamedTuple):
@@ -47,14 +57,17 @@ class State(NamedTuple):
 class Outcome(NamedTuple):
     """What one step reports."""
 
-    team: np.ndarray  # (W, team, D) observations
-    opponents: np.ndarray  # (W, opponents, D) observations
+    team: np.ndarray  # (W, team · D) observations
+    opponents: np.ndarray  # (W, opponents · D) observations
     rewards: np.ndarray  # (W, A)
     costs: np.ndarray  # (W, A)
     truncated: np.ndarray  # (W,) bool
 
 
-_NO_FORCE = -746.0  # exp() of less is exactly zero
+# Bodies further apart push each other with less than 1e-53, which no observation can show; down
+# to -746, where mpe2's force vanishes, the processor would take long over its tiny numbers.
+_NO_FORCE = -120.0
+_EXPONENTIAL = -40.0  # log(1 + exp(x)) of less is exp(x), to the last bit
 
 
 @_compiled
@@ -94,197 +107,160 @@ def step_worlds(rules, state, controls, out):
 
 @_compiled
 def observe_worlds(rules, state, worlds, team, opponents):
-    """Fill the observations (R, agents of the group, D) of the given worlds (R,)."""
+    """Fill the observations (R, agents of the group · D) of the given worlds (R,)."""
     _observe_worlds(Rules(*rules), State(*state), worlds, team, opponents)
 
 
 @_compiled
 def _step_worlds(rules, state, controls, out):
+    positions = state.positions
+    _push(rules.pushing, rules.pushing_at, positions, controls)
+    _move(rules.max_speeds, positions, state.velocities, controls)
+    if rules.task == _DECEPTION or rules.task == _KEEP_AWAY:
+        _reward_goal(rules.task, rules.is_team, positions, state.goals, out.rewards)
+    else:
+        _reward_hunt(rules.is_team, rules.catching, rules.catching_at, positions, out.rewards)
+    _cost(rules.counted, rules.counted_at, positions, out.costs)
     for w in range(len(controls)):
-        _push(rules.collides, rules.sizes, state.positions[w], controls[w])
-        _move(rules.max_speeds, state.positions[w], state.velocities[w], controls[w])
-        _reward(rules, state.positions[w], state.goals[w], out.rewards[w])
-        _cost(rules.counted, rules.sizes, state.positions[w], out.costs[w])
         state.clock[w] += 1
         out.truncated[w] = state.clock[w] >= rules.max_cycles
     _observe_worlds(rules, state, np.arange(len(controls)), out.team, out.opponents)
 
 
 @_compiled
-def _distance(positions, i, j):
-    dx = positions[i, 0] - positions[j, 0]
-    dy = positions[i, 1] - positions[j, 1]
+def _distance(positions, w, i, j):
+    dx = positions[w, i, 0] - positions[w, j, 0]
+    dy = positions[w, i, 1] - positions[w, j, 1]
     return math.sqrt(dx * dx + dy * dy)
 
 
 @_compiled
-def _touch(sizes, positions, i, j):
-    return _distance(positions, i, j) < sizes[i] + sizes[j]
+def _softened(depth):
+    """log(1 + exp(depth)), without overflow."""
+    if depth < _EXPONENTIAL:
+        return math.exp(depth)
+    return max(depth, 0.0) + math.log1p(math.exp(-abs(depth)))
 
 
 @_compiled
-def _push(collides, sizes, positions, forces):
+def _push(pairs, touching, positions, forces):
     """Add the soft contact forces between bodies that collide."""
-    n_agents = len(forces)
-    for i in range(n_agents):  # landmarks do not move, so pairs of them do not matter
-        for j in range(i + 1, len(positions)):
-            if not (collides[i] and collides[j]):
-                continue
-            distance = _distance(positions, i, j)
-            depth = -(distance - (sizes[i] + sizes[j])) / _CONTACT_MARGIN
+    n_agents = forces.shape[1]
+    for w in range(len(forces)):
+        for p in range(len(pairs)):
+            i, j = pairs[p]
+            distance = _distance(positions, w, i, j)
+            depth = -(distance - touching[p]) / _CONTACT_MARGIN
             if depth < _NO_FORCE:
                 continue
-            # log(1 + exp(depth)), without overflow
-            softened = max(depth, 0.0) + math.log1p(math.exp(-abs(depth)))
+            size = _softened(depth) * _CONTACT_MARGIN
             for axis in range(2):
-                direction = _CONTACT_FORCE * (positions[i, axis] - positions[j, axis]) / distance
-                force = direction * (softened * _CONTACT_MARGIN)
-                forces[i, axis] += force
-                if j < n_agents:
-                    forces[j, axis] -= force
+                way = positions[w, i, axis] - positions[w, j, axis]
+                force = _CONTACT_FORCE * way / distance * size
+                forces[w, i, axis] += force
+                if j < n_agents:  # landmarks do not move
+                    forces[w, j, axis] -= force
 
 
 @_compiled
 def _move(max_speeds, positions, velocities, forces):
     """Positions by the old velocities, then velocities; their norm is clipped."""
-    for i in range(len(forces)):
-        for axis in range(2):
-            positions[i, axis] += velocities[i, axis] * _DT
-            velocities[i, axis] = velocities[i, axis] * (1.0 - _DAMPING) + forces[i, axis] * _DT
-        speed = math.sqrt(velocities[i, 0] ** 2 + velocities[i, 1] ** 2)
-        if speed > max_speeds[i]:
+    for w in range(len(forces)):
+        for i in range(len(max_speeds)):
             for axis in range(2):
-                velocities[i, axis] = velocities[i, axis] / speed * max_speeds[i]
+                old = velocities[w, i, axis]
+                positions[w, i, axis] += old * _DT
+                velocities[w, i, axis] = old * (1.0 - _DAMPING) + forces[w, i, axis] * _DT
+            speed = math.sqrt(velocities[w, i, 0] ** 2 + velocities[w, i, 1] ** 2)
+            if speed > max_speeds[i]:
+                for axis in range(2):
+                    velocities[w, i, axis] = velocities[w, i, axis] / speed * max_speeds[i]
 
 
 @_compiled
-def _reward(rules, positions, goal, rewards):
-    if rules.task == _DECEPTION or rules.task == _KEEP_AWAY:
-        _reward_goal(rules.task, rules.is_team, positions, len(rewards) + goal, rewards)
-    else:
-        _reward_hunt(rules.is_team, rules.sizes, positions, rewards)
-
-
-@_compiled
-def _reward_goal(task, is_team, positions, goal, rewards):
+def _reward_goal(task, is_team, positions, goals, rewards):
     """Deception: closest of the team against the adversary. Keep away: everyone for oneself."""
-    closest, others = np.inf, 0.0
-    for i in range(len(rewards)):
-        rewards[i] = -_distance(positions, i, goal)
-        if is_team[i]:
-            closest = min(closest, _distance(positions, i, goal))
-        else:
-            others += _distance(positions, i, goal)
-    for i in range(len(rewards)):
-        if task == _DECEPTION and is_team[i]:
-            rewards[i] = -closest + others
-        elif task == _KEEP_AWAY and not is_team[i]:
-            rewards[i] = closest - _distance(positions, i, goal)
+    n_agents = len(is_team)
+    distances = np.empty(n_agents)
+    for w in range(len(goals)):
+        closest, others = np.inf, 0.0
+        for i in range(n_agents):
+            distances[i] = _distance(positions, w, i, n_agents + goals[w])
+            if is_team[i]:
+                closest = min(closest, distances[i])
+            else:
+                others += distances[i]
+        for i in range(n_agents):
+            rewards[w, i] = -distances[i]
+            if task == _DECEPTION and is_team[i]:
+                rewards[w, i] = -closest + others
+            elif task == _KEEP_AWAY and not is_team[i]:
+                rewards[w, i] = closest - distances[i]
 
 
 @_compiled
-def _reward_hunt(is_team, sizes, positions, rewards):
+def _reward_hunt(is_team, pairs, touching, positions, rewards):
     """Predators share 10 per touch of the prey; the prey loses it, and more when it is outside."""
-    touches = 0
-    for i in range(len(rewards)):
-        if is_team[i]:
-            continue
-        caught = 0
-        for j in range(len(rewards)):
-            if is_team[j] and _touch(sizes, positions, i, j):
-                caught += 1
-        touches += caught
-        outside = _outside(abs(positions[i, 0])) + _outside(abs(positions[i, 1]))
-        rewards[i] = -10.0 * caught - outside
-    for i in range(len(rewards)):
-        if is_team[i]:
-            rewards[i] = 10.0 * touches
+    n_agents = len(is_team)
+    caught = np.empty(n_agents)
+    for w in range(len(rewards)):
+        caught[:] = 0.0
+        for p in range(len(pairs)):
+            i, j = pairs[p]
+            caught[i] += _distance(positions, w, i, j) < touching[p]
+        for i in range(n_agents):
+            if is_team[i]:
+                rewards[w, i] = 10.0 * caught.sum()
+            else:
+                outside = _outside(positions[w, i, 0]) + _outside(positions[w, i, 1])
+                rewards[w, i] = -10.0 * caught[i] - outside
 
 
 @_compiled
-def _outside(x):
+def _outside(coordinate):
+    x = abs(coordinate)
     if x < 0.9:
         return 0.0
     return (x - 0.9) * 10.0 if x < 1.0 else min(math.exp(2.0 * x - 2.0), 10.0)
 
 
 @_compiled
-def _cost(counted, sizes, positions, costs):
-    for i in range(len(costs)):
-        costs[i] = 0.0
-        for j in range(len(positions)):
-            if counted[i, j] and _touch(sizes, positions, i, j):
-                costs[i] = 1.0
+def _cost(pairs, touching, positions, costs):
+    costs[:] = 0.0
+    for w in range(len(costs)):
+        for p in range(len(pairs)):
+            i, j = pairs[p]
+            if _distance(positions, w, i, j) < touching[p]:
+                costs[w, i] = 1.0
 
 
 @_compiled
 def _observe_worlds(rules, state, worlds, team, opponents):
+    numbers = rules.numbers.copy()
     for row in range(len(worlds)):
-        w = worlds[row]
-        positions, velocities = state.positions[w], state.velocities[w]
-        n_team = 0
-        for i in range(len(velocities)):
-            if rules.is_team[i]:
-                out = team[row, n_team]
-                n_team += 1
-            else:
-                out = opponents[row, i - n_team]
-            _observe(rules.is_team, rules.views, i, positions, velocities, state.goals[w], out)
+        _read(
+            state.positions, state.velocities, state.goals, rules.goal_colors, worlds[row], numbers
+        )
+        _observe(numbers, rules.team, team, row)
+        _observe(numbers, rules.opponents, opponents, row)
 
 
 @_compiled
-def _observe(is_team, views, i, positions, velocities, goal, out):
-    n_agents, n_entities = len(velocities), len(positions)
-    velocity, position, sees_goal, colors, prey_velocity = views[int(is_team[i])]
-    end = 0
-    if velocity:
-        end = _append(out, end, velocities[i, 0], velocities[i, 1])
-    if position:
-        end = _append(out, end, positions[i, 0], positions[i, 1])
-    if sees_goal:
-        end = _append_relative(out, end, positions, i, n_agents + goal)
-    if colors:
-        end = _append_color(out, end, 0.25, 0.5, goal)
-    end = _append_range(out, end, positions, i, n_agents, n_entities)
-    if colors:
-        for landmark in range(n_entities - n_agents):
-            end = _append_color(out, end, 0.1, 0.8, landmark)
-    end = _append_range(out, end, positions, i, 0, n_agents)
-    if prey_velocity:
-        _append_prey(is_team, out, end, velocities)
-
-
-@_compiled
-def _append_range(out, end, positions, i, first, stop):
-    """Relative positions of a range of entities, without the agent itself."""
-    for j in range(first, stop):
-        if j != i:
-            end = _append_relative(out, end, positions, i, j)
-    return end
-
-
-@_compiled
-def _append_prey(is_team, out, end, velocities):
-    for j in range(len(velocities)):
-        if not is_team[j]:
-            end = _append(out, end, velocities[j, 0], velocities[j, 1])
-
-
-@_compiled
-def _append(out, end, x, y):
-    out[end] = x
-    out[end + 1] = y
-    return end + 2
-
-
-@_compiled
-def _append_relative(out, end, positions, i, j):
-    return _append(out, end, positions[j, 0] - positions[i, 0], positions[j, 1] - positions[i, 1])
-
-
-@_compiled
-def _append_color(out, end, gray, more, landmark):
-    """A color in which channel ``landmark`` + 1 stands out."""
+def _read(positions, velocities, goals, goal_colors, w, numbers):
+    """The numbers of a world that change, in the order of ``_particle_views``."""
+    n_agents, n_entities = velocities.shape[1], positions.shape[1]
+    goal, end = goals[w], 2 * (n_agents + n_entities)
+    for axis in range(2):
+        for j in range(n_entities):
+            numbers[2 * j + axis] = positions[w, j, axis]
+        for i in range(n_agents):
+            numbers[2 * (n_entities + i) + axis] = velocities[w, i, axis]
+        numbers[end + axis] = positions[w, n_agents + goal, axis]
     for channel in range(3):
-        out[end + channel] = gray + (more if channel == landmark + 1 else 0.0)
-    return end + 3
+        numbers[end + 2 + channel] = goal_colors[goal, channel]
+
+
+@_compiled
+def _observe(numbers, terms, out, row):
+    for k in range(terms.shape[1]):
+        out[row, k] = numbers[terms[0, k]] - numbers[terms[1, k]]

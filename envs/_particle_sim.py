@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_e2c.envs._checks import check_render_mode, check_running, require_render_mode
-from sb3_e2c.envs._particle_config import TASKS, ParticleConfig, Start, draw_start, place
+from sb3_e2c.envs._particle_config import TASKS, ParticleConfig, draw_starts, place
 from sb3_e2c.envs._particle_kernels import (
     Outcome,
     Rules,
@@ -18,6 +18,7 @@ from sb3_e2c.envs._particle_kernels import (
     push_by_actions,
     step_worlds,
 )
+from sb3_e2c.envs._particle_views import colors, constant_numbers, terms
 
 Grouped = dict[str, np.ndarray]
 Infos = dict[str, dict[str, np.ndarray]]
@@ -62,6 +63,11 @@ class ParticleSimulator:
         self._needs_reset = np.ones(n_worlds, dtype=bool)
         self.state = _initial_state(n_worlds, len(task.agents), len(task.bodies))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the tables of the compiled code anew: an older version may have pickled others."""
+        self.__dict__.update(state)
+        self._rules = tuple(_rules(self.config))
+
     def observation_space(self, agent: str) -> spaces.Box:
         """Observation space of an agent; the same object at every call."""
         return self._observation_spaces[agent]
@@ -85,11 +91,8 @@ class ParticleSimulator:
         :return: observations (R, n, D) and infos (empty), both by group
         """
         worlds = np.asarray(worlds, dtype=np.int64)
-        starts = [self._draw(w, seed) for w, seed in zip(worlds.tolist(), seeds, strict=True)]
-        if not starts:
-            return self._observe(worlds), {group: {} for group in _GROUPS}
-        goals, positions = zip(*starts, strict=True)
-        start = Start(np.array(goals, dtype=np.int64), np.stack(positions))
+        pairs = zip(worlds.tolist(), seeds, strict=True)
+        start = draw_starts(self.config.task, [self._stream(w, seed) for w, seed in pairs])
         place(self.config.task, start, options)
         self.state.goals[worlds] = start.goals
         self.state.positions[worlds] = self.state.starts[worlds] = start.positions
@@ -98,23 +101,32 @@ class ParticleSimulator:
         self._needs_reset[worlds] = False
         return self._observe(worlds), {group: {} for group in _GROUPS}
 
-    def _draw(self, world: int, seed: int | None) -> tuple[int, np.ndarray]:
+    def _stream(self, world: int, seed: int | None) -> np.random.Generator:
         rng = self._rngs[world]
         if seed is not None or rng is None:
             rng = self._rngs[world] = np.random.default_rng(seed)
-        return draw_start(self.config.task, rng)
+        return rng
 
     def _observe(self, worlds: np.ndarray) -> Grouped:
-        observations = self._empty_observations(len(worlds))
-        observe_worlds(self._rules, tuple(self.state), worlds, *observations.values())
-        return observations
+        rows = self._empty_rows(len(worlds))
+        observe_worlds(self._rules, tuple(self.state), worlds, *rows)
+        return self._grouped(rows)
 
-    def _empty_observations(self, n_worlds: int) -> Grouped:
-        return {
-            group: np.empty(
-                (n_worlds, len(self.groups[group]), self.observation_sizes[group]), np.float32
+    def _empty_rows(self, n_worlds: int) -> tuple[np.ndarray, np.ndarray]:
+        """Room for the observations of the team and of the opponents, (n_worlds, n · D)."""
+        team, opponents = (
+            np.empty(
+                (n_worlds, len(self.groups[group]) * self.observation_sizes[group]), np.float32
             )
             for group in _GROUPS
+        )
+        return team, opponents
+
+    def _grouped(self, rows: tuple[np.ndarray, np.ndarray]) -> Grouped:
+        """The same arrays, each in the shape (n_worlds, n, D)."""
+        return {
+            group: array.reshape(-1, len(self.groups[group]), self.observation_sizes[group])
+            for group, array in zip(_GROUPS, rows, strict=True)
         }
 
     def step(
@@ -128,10 +140,10 @@ class ParticleSimulator:
         """
         check_running(self._needs_reset)
         controls = self._controls(actions)
-        observations = self._empty_observations(self.n_worlds)
+        rows = self._empty_rows(self.n_worlds)
         shape = controls.shape[:2]
         out = Outcome(
-            **observations,
+            *rows,
             rewards=np.empty(shape, np.float32),
             costs=np.empty(shape, np.float32),
             truncated=np.empty(self.n_worlds, np.bool_),
@@ -140,7 +152,8 @@ class ParticleSimulator:
         self._needs_reset[:] = out.truncated
         rewards = {group: out.rewards[:, members] for group, members in self._members.items()}
         infos = {group: {"cost": out.costs[:, self._members[group]]} for group in _GROUPS}
-        return observations, rewards, np.zeros(self.n_worlds, np.bool_), out.truncated, infos
+        terminated = np.zeros(self.n_worlds, np.bool_)
+        return self._grouped(rows), rewards, terminated, out.truncated, infos
 
     def _controls(self, actions: Mapping[str, np.ndarray]) -> np.ndarray:
         """The forces (W, A, 2) that the agents apply, in world order."""
@@ -223,18 +236,26 @@ def action_spaces(config: ParticleConfig) -> dict[str, spaces.Space]:
 
 
 def _rules(config: ParticleConfig) -> Rules:
-    task = config.task
-    sizes, collides, _, max_speeds = zip(*task.bodies, strict=True)
-    n_agents = len(task.agents)
+    task, n_agents = config.task, len(config.task.agents)
+    sizes, collides, _, max_speeds = (np.array(column) for column in zip(*task.bodies, strict=True))
+    team = np.array([agent in task.team for agent in task.agents])
+    touching = np.add.outer(sizes, sizes)
+    pairs = {
+        "pushing": np.triu(np.outer(collides[:n_agents], collides), k=1),
+        "counted": config.counted,
+        "catching": np.outer(~team, team),
+    }
+    found = {name: np.argwhere(chosen) for name, chosen in pairs.items()}
     return Rules(
         task=TASKS.index(task),
         max_cycles=config.max_cycles,
-        is_team=np.array([agent in task.team for agent in task.agents]),
-        sizes=np.array(sizes),
-        collides=np.array(collides),
-        max_speeds=np.array(max_speeds[:n_agents]),
-        counted=config.counted,
-        views=np.array([task.opponent_view, task.team_view]),
+        is_team=team,
+        max_speeds=max_speeds[:n_agents],
+        **found,
+        **{f"{name}_at": touching[tuple(rows.T)] for name, rows in found.items()},
+        goal_colors=colors(task.n_landmarks, 0.25, 0.5),
+        numbers=constant_numbers(task),
+        **{group: terms(task, group) for group in _GROUPS},
     )
 
 

@@ -359,7 +359,7 @@ def ended_worlds(step: Step, n_agents: int) -> np.ndarray:
     :param step: of all worlds
     :param n_agents: N
     """
-    return np.flatnonzero((step.terminated | step.truncated)[::n_agents])
+    return (step.terminated | step.truncated)[::n_agents].nonzero()[0]
 
 
 def begun(parts: Sequence[tuple[Any, ...]], form: Form) -> tuple[np.ndarray, Infos]:
@@ -407,8 +407,8 @@ def batched_step(
     return Step(
         _flat(form.observations("step", observations, n_worlds)),
         np.array(paid).reshape(-1),
-        np.repeat(terminated, n_agents),
-        np.repeat(truncated, n_agents),
+        terminated.repeat(n_agents),
+        truncated.repeat(n_agents),
         _rows("step", columns, n_worlds, form),
         {},
     )
@@ -453,7 +453,7 @@ def close_episodes(step: Step) -> np.ndarray:
     """
     dones: np.ndarray = step.terminated | step.truncated
     timeouts = step.truncated & ~step.terminated
-    for slot in np.flatnonzero(dones).tolist():
+    for slot in dones.nonzero()[0].tolist():
         step.infos[slot]["TimeLimit.truncated"] = bool(timeouts[slot])
     return dones
 
@@ -471,7 +471,7 @@ def _rows(call: str, columns: dict[str, np.ndarray], n_worlds: int, form: Form) 
     flat = [_flat(_column(call, name, column, shape)) for name, column in columns.items()]
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in flat]
     if not lists:
-        return [{} for _ in range(int(np.prod(shape)))]
+        return [{} for _ in range(n_worlds * form.n_agents)]
     if len(lists) == 1:  # several times faster than the general way, and the common case
         (name,) = columns
         return [{name: value} for value in lists[0]]

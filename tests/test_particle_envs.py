@@ -225,6 +225,33 @@ def test_the_environment_equals_the_one_that_mpe2_ships(module, name, parameters
         np.testing.assert_equal(mine[:4], theirs[:4])
 
 
+@pytest.mark.parametrize("depth", [-0.5, -10, -39, -41, -119, -121, -745, -747])
+def test_bodies_push_each_other_as_mpe2_has_it_however_far_they_are(depth):
+    """Bodies are 0.1 + 0.001 * -depth apart; what is left out further away is below 1e-50."""
+    env = keep_away_v0.parallel_env()
+    apart = 0.1 - 0.001 * depth
+    entities = placed(6, e1=(0.0, 0.0), e2=(0.6 * apart, 0.8 * apart))
+    options = {"agents": entities[:4], "landmarks": entities[4:]}
+    sim = env.batched_groups(1)
+    sim.reset(np.arange(1), [0], options)
+    env.reset(seed=0, options=options)
+    sim.step(nothing(sim))
+    env.step(dict.fromkeys(env.agents, 0))
+    expected = [agent.state.p_vel for agent in env._world.world.agents]
+    np.testing.assert_allclose(sim.state.velocities[0], expected, rtol=1e-12, atol=1e-50)
+    assert (sim.state.velocities[0, 2, 0] > 0) == (depth > -120)
+
+
+@each_module
+def test_starts_are_those_of_mpe2_to_the_last_bit(module):
+    env, sim = module.parallel_env(), module.parallel_env().batched_groups(3)
+    sim.reset(np.arange(3), [5, 6, 7])
+    for w in range(3):
+        env.reset(seed=5 + w)
+        expected = [entity.state.p_pos for entity in env._world.world.entities]
+        np.testing.assert_array_equal(sim.state.positions[w], expected)
+
+
 def test_keep_away_with_one_good_agent_is_the_push_task_of_mpe2(monkeypatch):
     scenario = import_module("sb3_e2c.envs._particle_keep_away")
     mpe2 = import_module("mpe2.simple_push_v3").parallel_env(max_cycles=20)
@@ -285,6 +312,40 @@ def test_the_next_episode_of_a_world_continues_its_stream():
     np.testing.assert_array_equal(sim.state.positions[0], before[0])
 
 
+@each_module
+@each_kind
+def test_a_world_behaves_the_same_whatever_the_number_of_worlds(module, continuous):
+    env = module.parallel_env(continuous_actions=continuous, max_cycles=30)
+    many, alone = env.batched_groups(9), [env.batched_groups(1) for _ in range(9)]
+    found = [many.reset(np.arange(9), range(9))]
+    expected = [[sim.reset(np.arange(1), [w]) for w, sim in enumerate(alone)]]
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        actions = random_actions(rng, many)
+        own = [{g: array[[w]] for g, array in actions.items()} for w in range(9)]
+        found.append(many.step(actions))
+        expected.append([sim.step(each) for sim, each in zip(alone, own, strict=True)])
+    ended = np.array([7, 2])
+    found.append(many.reset(ended, [None, 11]))
+    expected.append([alone[7].reset(np.arange(1), [None]), alone[2].reset(np.arange(1), [11])])
+    for joint, single in zip(found, expected, strict=True):
+        observations, infos = joint[0], joint[-1]
+        for group in many.groups:
+            rows = [answer[0][group] for answer in single]
+            np.testing.assert_array_equal(observations[group], np.concatenate(rows))
+            for key, column in infos[group].items():
+                rows = [answer[-1][group][key] for answer in single]
+                np.testing.assert_array_equal(column, np.concatenate(rows))
+
+
+def test_no_world_can_be_reset_either():
+    observations, _ = keep_away_v0.parallel_env().batched_groups(2).reset(np.arange(0), [])
+    assert {g: array.shape for g, array in observations.items()} == {
+        "team": (0, 3, 23),
+        "opponents": (0, 1, 12),
+    }
+
+
 def test_options_do_not_touch_the_stream():
     first, second = (physical_deception_v0.parallel_env() for _ in range(2))
     first.reset(seed=0, options={"goal": 2, "agents": FAR[:4]})
@@ -302,6 +363,16 @@ def test_a_pickled_simulator_continues_identically():
     np.testing.assert_equal(sim.step(actions), copy.step(actions))
     np.testing.assert_equal(
         sim.reset(np.arange(3), [None] * 3), copy.reset(np.arange(3), [None] * 3)
+    )
+
+
+def test_a_pickle_of_an_older_version_gets_the_tables_of_this_one():
+    sim = keep_away_v0.parallel_env().batched_groups(1)
+    sim.reset(np.arange(1), [0])
+    old = pickle.loads(pickle.dumps(sim))
+    old._rules = ("tables", "of", "another", "version")
+    np.testing.assert_equal(
+        pickle.loads(pickle.dumps(old)).step(nothing(sim)), sim.step(nothing(sim))
     )
 
 
