@@ -19,6 +19,7 @@ COMMANDS = {
     "plot": "draw the curves of a run, or the figures of a benchmark",
     "tune": "search for hyperparameters",
     "speed": "train beside other libraries and compare the speed",
+    "stepping": "step an environment beside other ways to step it",
     "completion": "print a script that completes flags in bash or zsh",
 }
 

@@ -44,7 +44,7 @@ from sb3_e2c.zoo.peers import (
     sb3_iteration,
 )
 
-_CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ def benchmark(args: argparse.Namespace) -> dict[str, Any]:
     task = TASKS[args.env]
     plan, same = _plan(args, task), args.same_environment or not task.batched
     learners = [_ours(task, plan, same), *_peers(args.peer, plan)]
-    contenders = [Contender(learner, _CLOCKS[args.clock]) for learner in learners]
+    contenders = [Contender(learner, CLOCKS[args.clock]) for learner in learners]
     for _ in range(args.rounds):
         for threads in args.threads:
             for contender in contenders:
@@ -340,7 +340,7 @@ def make_parser() -> ConsoleParser:
     )
     add(
         "--clock",
-        choices=tuple(_CLOCKS),
+        choices=tuple(CLOCKS),
         default="wall",
         help="cpu: seconds that the processor worked for us, on a busy machine (default: wall)",
     )
