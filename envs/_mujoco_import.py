@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["GL_ADVICE", "MujocoEnv", "mujoco"]
+__all__ = ["GL_ADVICE", "Batch", "MujocoEnv", "mujoco"]
 
 GL_ADVICE = "install libegl1 and set MUJOCO_GL=egl, or install libosmesa6 and set MUJOCO_GL=osmesa"
 
@@ -20,3 +20,8 @@ except Exception as error:  # MuJoCo loads OpenGL at once, which fails in many w
         f"MuJoCo cannot be imported with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r} "
         f"({type(error).__name__}); unset MUJOCO_GL, or {GL_ADVICE}"
     ) from error
+
+try:
+    from mujoco.batch import Batch
+except ImportError:  # before MuJoCo 4.0
+    Batch = None

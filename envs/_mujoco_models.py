@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib.resources import files
+from typing import Any
 from xml.etree import ElementTree as ET
 
 from sb3_e2c.envs._mujoco_config import RobotConfig
@@ -14,6 +15,7 @@ from sb3_e2c.envs._mujoco_hazards import BOMB_START, WALL_OFFSET
 from sb3_e2c.envs._mujoco_import import mujoco
 
 STOCK_XML = {"Ant": "ant.xml", "HalfCheetah": "half_cheetah.xml"}
+_HEIGHT = {"Ant": 2, "HalfCheetah": 1}  # number of the joint position that is the height
 BOMB = "bomb"  # name of the body's joint, geom and motor
 
 _WALL_COLOR = "0.95 0.45 0.4 0.4"
@@ -40,15 +42,75 @@ _CAMERAS = {
 def build_fast_model(config: RobotConfig) -> mujoco.MjModel:
     """Compile a model that moves alike, bit for bit, without what only takes time.
 
-    That is walls without contact, and the search for independent groups of contacts (islands),
-    which is in vain where all joints belong to one tree.
+    That is walls without contact, the search for independent groups of contacts (islands), which
+    is in vain where all joints belong to one tree, and the search for bodies that may touch each
+    other, where these can be listed.
 
     :param config: scenario, kind of walls and of cost
     """
-    model = build_model(replace(config, walls="none") if config.walls == "visual" else config)
+    config = replace(config, walls="none") if config.walls == "visual" else config
+    model = build_model(config)
+    pairs = _pairs(model)
+    if _is_listable(model, pairs):
+        model = _list_contacts(config, model, pairs)
     if model.ntree == 1:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return model
+
+
+def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Geoms that may touch each other by their masks."""
+    kind, partner = model.geom_contype, model.geom_conaffinity
+    return [
+        (i, j)
+        for i in range(model.ngeom)
+        for j in range(i + 1, model.ngeom)
+        if (kind[i] & partner[j]) | (kind[j] & partner[i])
+    ]
+
+
+def _is_listable(model: mujoco.MjModel, pairs: list[tuple[int, int]]) -> bool:
+    """Whether all contacts have the same parameters, and bodies of one tree never touch."""
+    names = ("friction", "solref", "solimp", "margin", "gap", "condim", "solmix", "priority")
+    columns = [getattr(model, f"geom_{name}") for name in names]
+    tree = model.body_rootid[model.geom_bodyid]
+    is_uniform = all(bool((column == column[0]).all()) for column in columns)
+    return is_uniform and all(tree[one] != tree[other] for one, other in pairs)
+
+
+def _list_contacts(
+    config: RobotConfig, model: mujoco.MjModel, pairs: list[tuple[int, int]]
+) -> mujoco.MjModel:
+    """The same model with a list of what may touch, in place of masks.
+
+    :param config: parameters of the task
+    :param model: its model, see :func:`_is_listable`
+    :param pairs: geoms that may touch each other
+    """
+    root = ET.fromstring(build_xml(config))
+    contact = ET.SubElement(root, "contact")
+    for one, other in pairs:
+        ET.SubElement(contact, "pair", geom1=model.geom(one).name, geom2=model.geom(other).name)
+    for geom in root.iter("geom"):
+        geom.attrib.update(_NO_CONTACT)
+    listed = _compile(ET.tostring(root, encoding="unicode"))
+    touch = _touch(model, _HEIGHT[config.scenario])
+    for name in ("dim", "friction", "solref", "solreffriction", "solimp"):
+        getattr(listed, f"pair_{name}")[:] = getattr(touch, name)
+    listed.pair_margin[:] = touch.includemargin
+    return listed
+
+
+def _touch(model: mujoco.MjModel, height: int) -> Any:
+    """A contact of the robot with the floor, into which it is put.
+
+    :param model: the model
+    :param height: number of the joint position that is the height
+    """
+    data = mujoco.MjData(model)
+    data.qpos[height] -= 0.5
+    mujoco.mj_forward(model, data)
+    return data.contact[0]
 
 
 def build_model(config: RobotConfig) -> mujoco.MjModel:
@@ -56,12 +118,16 @@ def build_model(config: RobotConfig) -> mujoco.MjModel:
 
     :param config: scenario, kind of walls and of cost
     """
+    return _compile(build_xml(config))
+
+
+def _compile(xml: str) -> mujoco.MjModel:
     # The stock HalfCheetah uses a deprecated attribute; MuJoCo would tell so on stderr and in a
     # file MUJOCO_LOG.TXT in the current directory whenever a model is made.
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_ignore)
     try:
-        return mujoco.MjModel.from_xml_string(build_xml(config))
+        return mujoco.MjModel.from_xml_string(xml)
     finally:
         mujoco.set_mju_user_warning(handler)
 

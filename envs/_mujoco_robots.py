@@ -79,12 +79,12 @@ class Robot(ABC):
         """What the robot sees of walls or bomb, shape (W, H)."""
 
     @abstractmethod
-    def proprioception(self, now: Snapshot) -> np.ndarray:
-        """Own positions and velocities, shape (W, P)."""
+    def proprioception(self, now: Snapshot) -> list[np.ndarray]:
+        """Own positions and velocities, shape (W, P) together."""
 
     def state(self, now: Snapshot) -> np.ndarray:
         """State vector of the task, shape (W, P + H)."""
-        return np.concatenate([self.proprioception(now), self.hazard_view(now)], axis=1)
+        return np.concatenate([*self.proprioception(now), self.hazard_view(now)], axis=1)
 
     def judge(self, before: Snapshot, now: Snapshot, motors: np.ndarray) -> Verdict:
         """Rewards, costs and ends of one step.
@@ -93,21 +93,21 @@ class Robot(ABC):
         :param now: worlds after it
         :param motors: inputs of the robot's motors, shape (W, U)
         """
-        velocity = self._velocity(before, now)
+        along, across = self._velocity(before, now)
         terminated = self._is_over(now)
         place = self.whereabouts(now)
-        rewards = {"reward_forward": velocity[:, 0]} | self._earnings(now, motors, terminated)
+        rewards = {"reward_forward": along} | self._earnings(now, motors, terminated)
         if self.config.has_hazards:
             costs, parts = self._hazards(place, terminated)
         else:
-            speed = np.hypot(velocity[:, 0], velocity[:, 1])
+            speed = np.hypot(along, across)
             costs, parts = (speed > self.config.speed_limit) * 1.0, {"speed": speed}
         infos = {"cost": costs} | place | parts | rewards
         return Verdict(sum(rewards.values(), np.zeros(1)), costs, terminated, infos)
 
     @abstractmethod
-    def _velocity(self, before: Snapshot, now: Snapshot) -> np.ndarray:
-        """Mean velocity of the step in m/s, shape (W, 2)."""
+    def _velocity(self, before: Snapshot, now: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+        """Mean velocity of the step along x and y in m/s, shape (W,) each."""
 
     @abstractmethod
     def _earnings(
@@ -140,16 +140,16 @@ class Ant(Robot):
         """The motors are all there is."""
         return motors
 
-    def proprioception(self, now: Snapshot) -> np.ndarray:
+    def proprioception(self, now: Snapshot) -> list[np.ndarray]:
         """Height, orientation, joints (13), and all velocities (14)."""
-        return np.concatenate([now.qpos[:, 2:15], now.qvel[:, :14]], axis=1)
+        return [now.qpos[:, 2:15], now.qvel[:, :14]]
 
     def hazard_view(self, now: Snapshot) -> np.ndarray:
         """X / 5 m and the offset from the center line in m; nothing without corridor."""
         if not self.config.has_hazards:
             return np.empty((len(now.time), 0))
         x, y = now.qpos[:, 0], now.qpos[:, 1]
-        return np.stack([x / 5.0, corridor_offset(x, y)], axis=1)
+        return _side_by_side(x / 5.0, corridor_offset(x, y))
 
     def whereabouts(self, now: Snapshot) -> dict[str, np.ndarray]:
         """Position, and the offset from the center line of the corridor."""
@@ -157,8 +157,9 @@ class Ant(Robot):
         place = {"x_position": x, "y_position": y}
         return place | ({"y_offset": corridor_offset(x, y)} if self.config.has_hazards else {})
 
-    def _velocity(self, before: Snapshot, now: Snapshot) -> np.ndarray:
-        return (now.torso[:, :2] - before.torso[:, :2]) / SECONDS
+    def _velocity(self, before: Snapshot, now: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+        velocity = (now.torso[:, :2] - before.torso[:, :2]) / SECONDS
+        return velocity[:, 0], velocity[:, 1]
 
     def _earnings(
         self, now: Snapshot, motors: np.ndarray, terminated: np.ndarray
@@ -168,7 +169,7 @@ class Ant(Robot):
         return {
             "reward_survive": survived,
             "reward_ctrl": -0.5 * np.square(motors).sum(axis=1),
-            "reward_contact": -5e-4 * np.square(np.clip(now.contact, -1.0, 1.0)).sum(axis=1),
+            "reward_contact": -5e-4 * np.square(clipped(now.contact, 1.0)).sum(axis=1),
         }
 
     def _is_over(self, now: Snapshot) -> np.ndarray:
@@ -204,16 +205,16 @@ class HalfCheetah(Robot):
             return motors
         return np.concatenate([motors, bomb_control(time)[:, None]], axis=1)
 
-    def proprioception(self, now: Snapshot) -> np.ndarray:
+    def proprioception(self, now: Snapshot) -> list[np.ndarray]:
         """Height, pitch, joints (8), and the robot's velocities (9)."""
-        return np.concatenate([now.qpos[:, 1:9], now.qvel[:, :9]], axis=1)
+        return [now.qpos[:, 1:9], now.qvel[:, :9]]
 
     def hazard_view(self, now: Snapshot) -> np.ndarray:
         """The bomb's velocity in m/s, motor input and distance / 10 m; nothing without bomb."""
         if not self.config.has_hazards:
             return np.empty((len(now.time), 0))
-        distance = np.clip((now.bomb - now.qpos[:, 0]) / 10.0, -5.0, 5.0)
-        return np.stack([now.qvel[:, 9], bomb_control(now.time), distance], axis=1)
+        distance = clipped((now.bomb - now.qpos[:, 0]) / 10.0, 5.0)
+        return _side_by_side(now.qvel[:, 9], bomb_control(now.time), distance)
 
     def whereabouts(self, now: Snapshot) -> dict[str, np.ndarray]:
         """Position, and how far ahead the bomb is."""
@@ -222,9 +223,9 @@ class HalfCheetah(Robot):
             place["bomb_distance"] = now.bomb - now.qpos[:, 0]
         return place
 
-    def _velocity(self, before: Snapshot, now: Snapshot) -> np.ndarray:
+    def _velocity(self, before: Snapshot, now: Snapshot) -> tuple[np.ndarray, np.ndarray]:
         forward = (now.qpos[:, 0] - before.qpos[:, 0]) / SECONDS
-        return np.stack([forward, np.zeros_like(forward)], axis=1)
+        return forward, np.zeros_like(forward)
 
     def _earnings(
         self,
@@ -243,6 +244,19 @@ class HalfCheetah(Robot):
         terminated: np.ndarray,  # noqa: ARG002
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return bomb_cost(place["bomb_distance"]), {}
+
+
+def clipped(values: np.ndarray, most: float) -> np.ndarray:
+    """Numbers in [-most, most]: as NumPy's ``clip``, in half of its time for short arrays."""
+    return np.minimum(np.maximum(values, -most), most)
+
+
+def _side_by_side(*columns: np.ndarray) -> np.ndarray:
+    """Columns (W,) as an array (W, H), in a third of the time of NumPy's ``stack``."""
+    joined = np.empty((len(columns[0]), len(columns)))
+    for number, column in enumerate(columns):
+        joined[:, number] = column
+    return joined
 
 
 def new_robot(config: RobotConfig) -> Robot:

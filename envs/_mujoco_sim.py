@@ -16,9 +16,9 @@ from sb3_e2c.envs._checks import (
 )
 from sb3_e2c.envs._mujoco_config import METADATA, RobotConfig
 from sb3_e2c.envs._mujoco_models import build_fast_model, build_model
-from sb3_e2c.envs._mujoco_physics import Physics, get_state, set_state
+from sb3_e2c.envs._mujoco_physics import new_physics
 from sb3_e2c.envs._mujoco_render import Painter
-from sb3_e2c.envs._mujoco_robots import new_robot
+from sb3_e2c.envs._mujoco_robots import clipped, new_robot
 from sb3_e2c.envs._mujoco_start import draw_start, place
 from sb3_e2c.envs._mujoco_views import View
 
@@ -58,15 +58,15 @@ class RobotSimulator:
         self._clock = np.zeros(n_worlds, dtype=np.int64)
         self._is_costing = np.zeros(n_worlds, dtype=bool)
         self._build()
-        self.now = self._physics.read(list(range(n_worlds)))
+        self.now = self._physics.read()
 
     def _build(self) -> None:
         """Make what follows from the parameters alone."""
         self.robot = new_robot(self.config)
         self.model = build_fast_model(self.config)
         n_threads = self.config.n_threads
-        self._physics = Physics(self.model, self.n_worlds, self.robot.needs_contact, n_threads)
-        self._view = View(self.config, self.robot, self._physics.read([0]))
+        self._physics = new_physics(self.model, self.n_worlds, self.robot.needs_contact, n_threads)
+        self._view = View(self.config, self.robot, self._physics.read())
         self._order = self.config.action_order
         n_actions = len(self._order) // len(self.possible_agents)
         self._observation_spaces = {agent: self._view.space() for agent in self.possible_agents}
@@ -103,9 +103,7 @@ class RobotSimulator:
             for world, seed in zip(worlds.tolist(), seeds, strict=True)
         ]
         starts = place(starts, options)
-        for world, (qpos, qvel) in zip(worlds.tolist(), starts, strict=True):
-            self._physics.restart(world, qpos, qvel)
-        begun = self._physics.read(worlds.tolist())
+        begun = self._physics.restart(worlds, starts)
         for array, rows in zip(self.now, begun, strict=True):
             array[worlds] = rows
         self._clock[worlds] = 0
@@ -129,7 +127,7 @@ class RobotSimulator:
         """
         actions = np.asarray(actions, dtype=np.float64)
         self._check_step(actions)
-        joined = np.clip(actions, -1.0, 1.0).reshape(self.n_worlds, -1)
+        joined = clipped(actions, 1.0).reshape(self.n_worlds, -1)
         motors = joined.take(self._order, axis=1)
         before = self.now
         self.now = self._physics.advance(self.robot.controls(motors, before.time))
@@ -138,8 +136,8 @@ class RobotSimulator:
         truncated = self._clock >= self.config.max_steps
         self._is_costing = verdict.costs > 0.0
         self._needs_reset = verdict.terminated | truncated
-        rewards = self._for_agents({"reward": verdict.rewards})["reward"].astype(np.float32)
-        infos = self._for_agents(verdict.infos)
+        infos = self._for_agents(verdict.infos | {"reward": verdict.rewards})
+        rewards = infos.pop("reward").astype(np.float32)
         return self._view.observe(self.now), rewards, verdict.terminated, truncated, infos
 
     def _check_step(self, actions: np.ndarray) -> None:
@@ -150,8 +148,8 @@ class RobotSimulator:
 
     def _for_agents(self, values: dict[str, np.ndarray]) -> Infos:
         """The numbers of worlds (W,), the same for each of their agents (W, N)."""
-        n_agents = len(self.possible_agents)
-        return {key: np.repeat(value[:, None], n_agents, axis=1) for key, value in values.items()}
+        rows = np.array(list(values.values()))[:, :, None]
+        return dict(zip(values, np.repeat(rows, len(self.possible_agents), axis=2), strict=True))
 
     def render(self, world: int = 0) -> np.ndarray:
         """Picture of one world.
@@ -174,11 +172,11 @@ class RobotSimulator:
     def __getstate__(self) -> dict[str, Any]:
         """The whole state: numbers and random streams, not what :meth:`_build` makes again."""
         state = {name: getattr(self, name) for name in _STATE}
-        return state | {"mujoco": get_state(self.model, self._physics.datas)}
+        return state | {"mujoco": self._physics.get_state()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Continue where the pickle was taken."""
         physics = state.pop("mujoco")
         self.__dict__.update(state)
         self._build()
-        set_state(self.model, self._physics.datas, physics)
+        self._physics.set_state(physics)

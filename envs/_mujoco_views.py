@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_e2c.envs._mujoco_config import RobotConfig
-from sb3_e2c.envs._mujoco_robots import Robot, Snapshot
+from sb3_e2c.envs._mujoco_robots import Robot, Snapshot, clipped
 
 # gymnasium-robotics' defaults: what is seen of own joints, and of those 1, 2, ... joints away
 _OWN = {"Ant": ["qpos", "qvel", "cfrc_ext"], "HalfCheetah": ["qpos", "qvel"]}
@@ -104,6 +104,7 @@ class View:
         self.robot = robot
         self._index = _index(config, robot, example) if config.obs_mode == "obsk" else None
         self.n_agents = len(config.agents)
+        self._ids = np.eye(self.n_agents, self.n_agents * config.add_id)
         self.size = self.observe(example).shape[-1]
 
     def space(self) -> spaces.Box:
@@ -114,7 +115,7 @@ class View:
         """Observations (W, N, D), float32."""
         if self._index is None:
             return self.finish(self.robot.state(now)[:, None])
-        forces = np.clip(now.contact, -1.0, 1.0)
+        forces = clipped(now.contact, 1.0)
         zero = np.zeros((len(now.time), 1))
         blocks = (now.qpos, now.qvel, forces, self.robot.hazard_view(now), zero)
         return self.finish(np.concatenate(blocks, axis=1)[:, self._index])
@@ -125,11 +126,11 @@ class View:
         :param local: shape (W, N, D) without identities, or (W, 1, D) if all agents see the same
         """
         shape, size = (len(local), self.n_agents), local.shape[-1]
-        n_ids = self.n_agents * self.config.add_id
         is_scaled = self.config.per_vector_norm
-        whole = np.empty((*shape, size + n_ids), np.float64 if is_scaled else np.float32)
+        dtype = np.float64 if is_scaled else np.float32
+        whole = np.empty((*shape, size + self._ids.shape[1]), dtype)
         whole[..., :size] = local
-        whole[..., size:] = np.eye(self.n_agents, n_ids)
+        whole[..., size:] = self._ids
         if is_scaled:
             whole -= whole.mean(axis=-1, keepdims=True)
             whole /= whole.std(axis=-1, keepdims=True)

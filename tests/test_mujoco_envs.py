@@ -1,10 +1,12 @@
 """The robots: reference and batched worlds agree, stock parts are gymnasium's, hazards by hand."""
 
+import gc
 import os
 import pickle
 import re
 import subprocess
 import sys
+import time
 import warnings
 
 import gymnasium
@@ -14,11 +16,11 @@ import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
-from sb3_e2c.envs import ENV_IDS, safe_mamujoco_v0
+from sb3_e2c.envs import ENV_IDS, _mujoco_physics, safe_mamujoco_v0
 from sb3_e2c.envs._mujoco_config import MOTORS, SPLITS, RobotConfig
 from sb3_e2c.envs._mujoco_env import RobotEnv
 from sb3_e2c.envs._mujoco_hazards import bomb_control, bomb_cost, corridor_offset, wall_cost
-from sb3_e2c.envs._mujoco_models import build_fast_model, build_model
+from sb3_e2c.envs._mujoco_models import _is_listable, build_fast_model, build_model
 from sb3_e2c.envs._mujoco_views import factorize
 from sb3_e2c.vec_env import share_parameters
 
@@ -656,13 +658,30 @@ def test_what_a_step_returns_is_not_changed_by_later_steps():
     assert data_equivalence(kept, copies)
 
 
-@pytest.mark.parametrize("scenario", ROBOTS)
-def test_the_fast_model_moves_exactly_like_the_one_that_is_drawn(scenario):
-    config = RobotConfig(scenario)
+@pytest.mark.parametrize(
+    ("parameters", "start", "n_pairs"),
+    [
+        # floor and 13 parts of the Ant
+        ({"scenario": "Ant"}, {}, 13),
+        ({"scenario": "Ant", "cost_mode": "velocity"}, {}, 13),
+        # floor, 13 parts and 6 walls touch each other, but for two parts
+        ({"scenario": "Ant", "walls": "free"}, {1: 4.5}, 13 + 6 + 6 * 13 + 15),
+        # floor and 8 parts of the HalfCheetah, its bomb and all of these
+        ({"scenario": "HalfCheetah"}, {}, 8 + 1 + 8),
+        ({"scenario": "HalfCheetah"}, {0: 8.5}, 17),
+        ({"scenario": "HalfCheetah", "cost_mode": "velocity"}, {}, 8),
+    ],
+    ids=str,
+)
+def test_the_fast_model_moves_exactly_like_the_one_that_is_drawn(parameters, start, n_pairs):
+    config = RobotConfig(**parameters)
     models = build_model(config), build_fast_model(config)
-    assert models[0].ngeom > models[1].ngeom
+    assert (models[0].npair, models[1].npair) == (0, n_pairs)
     datas = [mujoco.MjData(model) for model in models]
-    rng = np.random.default_rng(0)
+    rng, touched = np.random.default_rng(0), set()
+    for data in datas:
+        for joint, value in start.items():
+            data.qpos[joint] += value
     for _ in range(200):
         controls = rng.uniform(-1, 1, models[0].nu)
         for model, data in zip(models, datas, strict=True):
@@ -670,7 +689,127 @@ def test_the_fast_model_moves_exactly_like_the_one_that_is_drawn(scenario):
             mujoco.mj_step(model, data, nstep=5)
             mujoco.mj_rnePostConstraint(model, data)
         np.testing.assert_array_equal(datas[0].qpos, datas[1].qpos)
+        np.testing.assert_array_equal(datas[0].qvel, datas[1].qvel)
         np.testing.assert_array_equal(datas[0].cfrc_ext, datas[1].cfrc_ext)
+        touched |= {models[0].geom(geom).name.rstrip("123456") for geom in datas[0].contact.geom2}
+    if start:  # right in front of the bomb, or of a wall
+        assert touched & {"bomb", "wall"}
+
+
+def test_contacts_are_listed_only_if_all_have_the_same_parameters():
+    model = build_model(RobotConfig("Ant", walls="none"))
+    floor = [(0, 1)]
+    assert _is_listable(model, floor)
+    assert not _is_listable(model, [(1, 2)])  # two parts of the same robot
+    model.geom_friction[3, 1] = 0.4
+    assert not _is_listable(model, floor)
+
+
+def slowly(monkeypatch, config, n_worlds):
+    """A simulator whose worlds are stepped by Python's threads."""
+    with monkeypatch.context() as patch:
+        patch.setattr(_mujoco_physics, "Batch", None)
+        return safe_mamujoco_v0.SafeMAMuJoCoEnv(config).batched(n_worlds)
+
+
+@pytest.mark.skipif(_mujoco_physics.Batch is None, reason="needs MuJoCo 4.0")
+@pytest.mark.parametrize("cost_mode", ["hazard", "velocity"])
+def test_mujocos_threads_and_pythons_give_the_same_numbers(cost_mode, monkeypatch):
+    config = RobotConfig("HalfCheetah", cost_mode=cost_mode, max_steps=20)
+    sims = safe_mamujoco_v0.SafeMAMuJoCoEnv(config).batched(5), slowly(monkeypatch, config, 5)
+    kinds = [type(sim._physics) for sim in sims]
+    assert kinds == [_mujoco_physics.BatchPhysics, _mujoco_physics.ThreadedPhysics]
+    rng = np.random.default_rng(0)
+    assert data_equivalence(*(sim.reset(np.arange(5), range(5)) for sim in sims))
+    for _ in range(50):
+        actions = actions_for(sims[0], rng)
+        mine, theirs = (sim.step(actions) for sim in sims)
+        assert data_equivalence(mine, theirs)
+        for a, b in zip(sims[0].now, sims[1].now, strict=True):
+            np.testing.assert_array_equal(a, b)
+        ended = np.flatnonzero(mine[3])
+        assert data_equivalence(*(sim.reset(ended, [None] * len(ended)) for sim in sims))
+    states = [sim.__getstate__()["mujoco"] for sim in sims]
+    np.testing.assert_array_equal(*states)
+
+
+@pytest.mark.parametrize("speed", [1e12, 1e9])  # refused at once, or leads to what is refused
+@pytest.mark.parametrize("scenario", ROBOTS)
+def test_an_unstable_world_starts_anew_in_both_ways_and_leaves_the_others_alone(
+    scenario, speed, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # MuJoCo warns in a log file
+    env = safe_mamujoco_v0.parallel_env(scenario=scenario)
+    speeds = np.zeros((3, env.single_agent_env.model.nv))
+    speeds[1, 3] = speed
+    sim, calm = env.batched(3), env.batched(2)
+    first, _ = sim.reset(np.arange(3), range(3), {"qvel": speeds})
+    np.testing.assert_array_equal(first[1], list(env.reset(1, {"qvel": speeds[1]})[0].values()))
+    calm.reset(np.arange(2), [0, 2], {"qvel": speeds[[0, 2]]})
+    for _ in range(1 if scenario == "Ant" else 4):  # the Ant has fallen then
+        actions = actions_for(sim, np.random.default_rng(0))
+        observations, rewards, *_ = sim.step(actions)
+        expected = env.step(dict(zip(env.possible_agents, actions[1], strict=True)))
+        np.testing.assert_array_equal(observations[1], list(expected[0].values()))
+        np.testing.assert_array_equal(rewards[1], np.float32(list(expected[1].values())))
+        np.testing.assert_array_equal(observations[[0, 2]], calm.step(actions[[0, 2]])[0])
+    assert "WARNING" in (tmp_path / "MUJOCO_LOG.TXT").read_text()
+
+
+def n_threads_at_most(number):
+    """Whether threads end; the system still lists a thread for a moment after it was joined."""
+    deadline = time.monotonic() + 5
+    while len(os.listdir("/proc/self/task")) > number and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return len(os.listdir("/proc/self/task")) <= number
+
+
+FORKED = """
+import os, signal, sys
+import numpy as np
+from sb3_e2c.envs import safe_mamujoco_v0
+sim = safe_mamujoco_v0.parallel_env(scenario=sys.argv[1], n_threads=2).batched(3)
+sim.reset(np.arange(3), range(3))
+actions = np.full((3, 2, *sim.action_space("agent_0").shape), 0.5)
+sim.step(actions)
+child = os.fork()
+signal.alarm(30)
+moved = sim.step(actions)[0] if sys.argv[2] == "steps" else sim.now.qpos
+status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if child else 0
+print(moved.tolist(), flush=True)
+sys.exit(status)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes are forked here")
+@pytest.mark.parametrize("does", ["steps", "only ends"])
+@pytest.mark.parametrize("scenario", ROBOTS)
+def test_a_forked_process_steps_its_worlds_and_ends(scenario, does):
+    command = [sys.executable, "-W", "ignore", "-c", FORKED, scenario, does]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    assert result.returncode == 0, result.stderr
+    of_child, of_parent = result.stdout.splitlines()
+    assert of_child == of_parent
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted on Linux")
+@pytest.mark.parametrize("scenario", ROBOTS)
+def test_close_ends_the_threads_and_a_later_step_starts_them_again(scenario):
+    gc.collect()  # simulators of other tests
+    before = len(os.listdir("/proc/self/task"))
+    sims = [
+        safe_mamujoco_v0.parallel_env(scenario=scenario, n_threads=3).batched(4) for _ in range(2)
+    ]
+    rng = np.random.default_rng(0)
+    for sim in sims:
+        sim.reset(np.arange(4), range(4))
+    for _ in range(3):
+        actions = actions_for(sims[0], rng)
+        assert data_equivalence(*(sim.step(actions) for sim in sims))
+        sims[0].close()
+        assert n_threads_at_most(before + 2)  # those of the second
+    sims[1].close()
+    assert n_threads_at_most(before)
 
 
 def test_a_time_limit_truncates():
