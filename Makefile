@@ -1,6 +1,7 @@
 # make train   install everything and train E2C-MAPPO (T) on the multi-rover task
 # make test    install everything and run the tests
 # make torture kill, starve, fuzz and deceive it, and print what survived (4 minutes)
+# make soak    train for MINUTES, and see whether memory, handles or files grow
 # Every other target installs first, too; a second call installs nothing.
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SOURCES := sb3_e2c/*.py envs zoo tests
 
-.PHONY: train test pytest torture format lint type check-codestyle commit-checks clean
+.PHONY: train test pytest torture soak format lint type check-codestyle commit-checks clean
 
 train: $(INSTALLED)
 	$(BIN)/python -m sb3_e2c.zoo.demo
@@ -19,6 +20,10 @@ test pytest: $(INSTALLED)
 
 torture: $(INSTALLED)
 	PYTHONPATH=tests timeout 600 $(BIN)/python -m torture
+
+MINUTES ?= 120
+soak: $(INSTALLED)
+	PYTHONPATH=tests $(BIN)/python -m torture.soak --minutes $(MINUTES) -o soak
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix $(SOURCES)

@@ -19,6 +19,7 @@ from sb3_e2c.sequences import (
     Cut,
     Memory,
     Sequences,
+    alternate,
     cut_at_ends,
     initial_memory,
     packed_rows,
@@ -328,6 +329,24 @@ def _random_steps(samples: TeamSamples, n_team_steps: int) -> Iterator[TeamSampl
     for indices in np.array_split(np.random.permutation(total), n_batches):
         chosen = th.from_numpy(indices).to(samples.observations.device)
         yield _take(samples, chosen)
+
+
+def halves(
+    samples: TeamSamples, sequences: Sequences | None
+) -> list[tuple[TeamSamples, Sequences | None]]:
+    """Divide a minibatch into two of nearly equal size, always in the same way.
+
+    :param samples: The minibatch
+    :param sequences: Its sequences, of which every other goes to the second half; if there are
+        none, the halves are views of the minibatch
+    :return: Two halves, or the whole if it is a single step or sequence
+    """
+    if sequences is not None:
+        return [(_take(samples, rows), half) for rows, half in alternate(sequences)]
+    middle = (len(samples.observations) + 1) // 2
+    ends = [slice(None, middle), slice(middle, None)]
+    parts = [TeamSamples(*(field[rows] for field in samples)) for rows in ends]
+    return [(part, None) for part in parts if len(part.observations)]
 
 
 def _take(samples: TeamSamples, rows: th.Tensor) -> TeamSamples:

@@ -6,6 +6,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from sb3_e2c.arguments import checked
 from sb3_e2c.callbacks import OEMRewardCallback
 from sb3_e2c.mappo import MAPPO
 
@@ -30,6 +31,7 @@ class E2CMAPPO(MAPPO):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
+        self.oem_kwargs = checked("oem_kwargs", self.oem_kwargs)
         super()._setup_model()
         self._oem_callback = OEMRewardCallback(**{"verbose": self.verbose, **self.oem_kwargs})
 

@@ -11,6 +11,7 @@ Shapes: T steps, W worlds, N agents, S = W·N slots (slot = world·N + agent), D
 K constrained parties (1: the team, N: each agent), M constraints.
 """
 
+import math
 import pathlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,6 +31,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_e2c.arguments import checked, settle
 from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
 from sb3_e2c.constraints import (
     CostScope,
@@ -39,16 +41,18 @@ from sb3_e2c.constraints import (
     party_limits,
     violation,
 )
-from sb3_e2c.losses import approx_kl, clip_fraction, normalize, policy_loss, value_loss
+from sb3_e2c.descent import Descent, update_threads
+from sb3_e2c.losses import normalize
 from sb3_e2c.monitor import named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
+from sb3_e2c.objective import Terms, Weights
 from sb3_e2c.opponents import adversary_path, load_learner
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory, Sequences
-from sb3_e2c.teams import check_counts, check_subclass, check_team, monitored, team_of
+from sb3_e2c.teams import check_batch, check_subclass, check_team, making, monitored, team_of
 from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
@@ -88,7 +92,11 @@ class MAPPO(PPO):
         standard deviation, for the reward and each cost separately
     :param opponent_kwargs: Arguments in which the opponents' model differs from the team's, in an
         :class:`sb3_e2c.OpponentVecEnv` whose opponents learn; it never has limits or a bonus
-    :raises ValueError: for limits or a scope that make no sense, or a batch smaller than a team
+    :param update_threads: Threads that share the work of an update, 1 or 2, which changes the
+        rounding. None: 2 if torch may use several (``torch.set_num_threads``), the process may use
+        several cores, and it is nobody's worker
+    :raises ValueError: for numbers that make no sense, or a batch smaller than a team
+    :raises TypeError: for arguments of another kind
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -101,7 +109,7 @@ class MAPPO(PPO):
             *("policy", "policy_kwargs", "learning_rate", "critic_learning_rate", "batch_size"),
             *("n_epochs", "gamma", "gae_lambda", "clip_range", "clip_range_vf", "target_kl"),
             *("normalize_advantage", "normalize_values", "ent_coef", "vf_coef", "max_grad_norm"),
-            *("reward_scale", "device"),
+            *("reward_scale", "update_threads", "device"),
         )
     )
     policy: TeamPolicy
@@ -111,6 +119,7 @@ class MAPPO(PPO):
     clip_range_vf: FloatSchedule | None
     # Asked after every epoch whether the update ends there; TrustRegionMonitor sets it.
     stop_epochs: Callable[[], bool] | None = None
+    _descent: Descent | None = None  # of the update that is going on
     _log_interval = 1
 
     def __init__(
@@ -138,6 +147,7 @@ class MAPPO(PPO):
         critic_learning_rate: float | Schedule | None = None,
         normalize_values: bool = False,
         opponent_kwargs: dict[str, Any] | None = None,
+        update_threads: int | None = None,
         target_kl: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -151,11 +161,12 @@ class MAPPO(PPO):
         self.cost_scope = cost_scope
         self.cost_gamma = cost_gamma
         self.multipliers_class = multipliers_class
-        self.multipliers_kwargs = multipliers_kwargs or {}
+        self.multipliers_kwargs = {} if multipliers_kwargs is None else multipliers_kwargs
         self.reward_scale = reward_scale
         self.critic_learning_rate = critic_learning_rate
         self.normalize_values = normalize_values
-        self.opponent_kwargs = opponent_kwargs or {}
+        self.opponent_kwargs = {} if opponent_kwargs is None else opponent_kwargs
+        self.update_threads = update_threads
         self.opponent: MAPPO | None = None  # the model of opponents that learn beside the team
         self._adversary_file: pathlib.Path | None = None  # where load() found it, not read yet
         # PPO's own constructor would only add checks on minibatches of rows, which are not ours.
@@ -172,19 +183,19 @@ class MAPPO(PPO):
             max_grad_norm=max_grad_norm,
             use_sde=False,
             sde_sample_freq=-1,
-            stats_window_size=stats_window_size,
+            stats_window_size=checked("stats_window_size", stats_window_size),
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            device=device,
+            verbose=checked("verbose", verbose),
+            device=checked("device", device),
             seed=seed,
             _init_setup_model=False,
             supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete),
         )
         self.batch_size = batch_size
         self.n_epochs = n_epochs
-        self.clip_range = FloatSchedule(clip_range)
-        self.clip_range_vf = None if clip_range_vf is None else FloatSchedule(clip_range_vf)
+        self.clip_range = clip_range  # type: ignore[assignment]  # until _setup_schedules()
+        self.clip_range_vf = clip_range_vf  # type: ignore[assignment]
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
         self.agents, self.critic_state_dim = team_of(self.env)
@@ -229,7 +240,8 @@ class MAPPO(PPO):
             **sizes,
             "critic_lr_schedule": self.critic_lr_schedule,
         }
-        OnPolicyAlgorithm._setup_model(self)
+        with making(self, user_kwargs):
+            OnPolicyAlgorithm._setup_model(self)
         self.policy_kwargs = user_kwargs
         shape = (parties, len(self.cost_limits))
         self.multipliers = self.multipliers_class(shape, **self.multipliers_kwargs).to(self.device)
@@ -278,16 +290,17 @@ class MAPPO(PPO):
         self.critic_lr_schedule: Schedule | None = None if own is None else FloatSchedule(own)
 
     def _check_setup(self) -> None:
-        check_counts(
-            self.n_agents,
-            n_steps=self.n_steps,
-            batch_size=self.batch_size,
-            n_epochs=self.n_epochs,
-        )
+        settle(self)
+        check_batch(self.n_agents, self.batch_size)
         check_subclass("policy_class", self.policy_class, TeamPolicy)
         check_subclass("multipliers_class", self.multipliers_class, Multipliers)
         if self.env is not None:
             check_team(self.env, self.agents, self.critic_state_dim)
+        elif not hasattr(self, "observation_space"):
+            raise TypeError(
+                "env is None; expected what share_parameters() returns, because it says how large "
+                "the networks are; load() needs none"
+            )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Use another environment with the same team; see ``PPO.set_env``."""
@@ -499,6 +512,14 @@ class MAPPO(PPO):
         samples = self.rollout_buffer.samples(
             self.policy, self.multipliers.values, self.normalize_values
         )
+        with Descent(self.policy, update_threads(self.update_threads)) as self._descent:
+            logs = self._train_epochs(samples)
+        self._descent = None
+        self._check_learned()
+        self._log_training(logs)
+
+    def _train_epochs(self, samples: TeamSamples) -> dict[str, list[float]]:
+        """All passes over the rollout; returns the numbers to log, by name."""
         logs: dict[str, list[float]] = defaultdict(list)
         for epoch in range(self.n_epochs):
             logs["approx_kl"].clear()  # as in PPO, only the last epoch's
@@ -510,8 +531,7 @@ class MAPPO(PPO):
                 break
             if self.stop_epochs is not None and self.stop_epochs():
                 break
-        self._check_learned()
-        self._log_training(logs)
+        return logs
 
     def _train_opponent(self) -> None:
         env = opponent_env(self.env)
@@ -523,68 +543,43 @@ class MAPPO(PPO):
 
         :return: False if the policy has moved further than ``target_kl`` allows
         """
+        weights = self._weights()
         batches = self.rollout_buffer.minibatches(samples, self.batch_size // self.n_agents)
         for batch, sequences in batches:
-            loss, kl = self._loss(batch, sequences, logs)
-            if self.target_kl is not None and kl > 1.5 * self.target_kl:
+            terms = self._gradient(batch, sequences, weights)
+            loss = terms.loss(weights)
+            for name, number in (*terms._asdict().items(), ("loss", loss)):
+                logs[name].append(number)
+            if self.target_kl is not None and terms.approx_kl > 1.5 * self.target_kl:
                 return False
             self._gradient_step(loss)
         return True
 
-    def _loss(
-        self, batch: TeamSamples, sequences: Sequences | None, logs: dict[str, list[float]]
-    ) -> tuple[th.Tensor, float]:
-        clip_range = self.clip_range(self._current_progress_remaining)
-        inputs = (batch.observations, batch.actions, batch.critic_states)
-        with self._explained_divergence():
-            new = self.policy.evaluate_steps(*inputs, sequences)
-        advantages = batch.advantages
+    def _weights(self) -> Weights:
+        progress, clip_vf = self._current_progress_remaining, self.clip_range_vf
+        return Weights(
+            clip_range=self.clip_range(progress),
+            clip_range_vf=None if clip_vf is None else clip_vf(progress),
+            ent_coef=self.ent_coef,
+            vf_coef=self.vf_coef,
+        )
+
+    def _gradient(self, batch: TeamSamples, sequences: Sequences | None, weights: Weights) -> Terms:
+        """Leave the gradient of the objective over a minibatch in the parameters."""
+        assert self._descent is not None, "train() makes it"
         if self.normalize_advantage:
-            advantages = normalize(advantages)
-        log_ratio = new.log_prob - batch.old_log_prob
-        ratio = th.exp(log_ratio)  # q of Eq. 8
-        actor = policy_loss(ratio, advantages, clip_range)  # l. 13, Eq. 8
-        value, cost_value = self._value_losses(new.values, new.cost_values, batch)  # l. 14, 16
-        entropy = -new.entropy.mean()
-        loss = actor + self.ent_coef * entropy + self.vf_coef * (value + cost_value)
-        with th.no_grad():
-            kl = approx_kl(log_ratio).item()
-            logs["policy_gradient_loss"].append(actor.item())
-            logs["value_loss"].append(value.item())
-            logs["cost_value_loss"].append(float(cost_value))
-            logs["entropy_loss"].append(entropy.item())
-            logs["clip_fraction"].append(clip_fraction(ratio, clip_range).item())
-            logs["approx_kl"].append(kl)
-            logs["loss"].append(loss.item())
-        return loss, kl
+            batch = batch._replace(advantages=normalize(batch.advantages))
+        with self._explained_divergence():
+            return self._descent.gradient(batch, sequences, weights)
 
-    def _value_losses(
-        self, values: th.Tensor, cost_values: th.Tensor, batch: TeamSamples
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """Loss of the reward critic, and the sum of those of the cost critics."""
-        clip = None
-        if self.clip_range_vf is not None:
-            clip = self.clip_range_vf(self._current_progress_remaining)
-        value = value_loss(values, batch.returns, batch.old_values, clip)
-        cost_value = th.zeros((), device=self.device)
-        pairs = zip(cost_values.unbind(-1), batch.cost_returns.unbind(-1), strict=True)
-        for (new, target), old in zip(pairs, batch.old_cost_values.unbind(-1), strict=True):
-            cost_value = cost_value + value_loss(new, target, old, clip)
-        return value, cost_value
-
-    def _gradient_step(self, loss: th.Tensor) -> None:
-        if not th.isfinite(loss):
-            raise self._divergence(f"the loss is {loss.item()}")
-        for parameters in self.policy.clipped_together:
-            for parameter in parameters:
-                parameter.grad = None  # as optimizer.zero_grad() does, ten times faster
-        loss.backward()
-        # The cost critics are clipped on their own, so that watching a cost does not change what
-        # the other networks learn (unless they share a features extractor that learns).
-        for parameters in self.policy.clipped_together:
-            norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-            if not th.isfinite(norm):  # clipped, they would be zero or no numbers
-                raise self._divergence(f"the size of the gradients is {norm.item()}")
+    def _gradient_step(self, loss: float) -> None:
+        """Follow the gradient that the parameters have."""
+        assert self._descent is not None, "train() makes it"
+        if not math.isfinite(loss):
+            raise self._divergence(f"the loss is {loss}")
+        for norm in self._descent.clip(self.max_grad_norm):
+            if not math.isfinite(norm):
+                raise self._divergence(f"the size of the gradients is {norm}")
         self.policy.optimizer.step()
 
     def _check_learned(self) -> None:
@@ -707,7 +702,7 @@ class MAPPO(PPO):
         return ["policy", "policy.optimizer", "multipliers"], []
 
     def _excluded_save_params(self) -> list[str]:
-        own = ("_recorder", "_memory", "stop_epochs", "opponent", "_adversary_file")
+        own = ("_recorder", "_memory", "_descent", "stop_epochs", "opponent", "_adversary_file")
         return [*super()._excluded_save_params(), *own]
 
     def save(

@@ -61,6 +61,7 @@ class GradientMultipliers(Multipliers):
         agent_scaling: bool = True,
     ):
         super().__init__(shape)
+        _check_form(shape, agent_scaling)
         _check(learning_rate=learning_rate, initial=initial, maximum=maximum)
         self.learning_rate = learning_rate * (shape[0] if agent_scaling else 1)
         self.maximum = maximum
@@ -102,6 +103,7 @@ class PIDMultipliers(Multipliers):
         agent_scaling: bool = True,
     ):
         super().__init__(shape)
+        _check_form(shape, agent_scaling)
         _check(kp=kp, ki=ki, kd=kd, initial=initial, maximum=maximum)
         scale = shape[0] if agent_scaling else 1
         self.kp, self.ki, self.kd = scale * kp, scale * ki, scale * kd
@@ -124,9 +126,18 @@ def _times(gain: float, violation: th.Tensor) -> th.Tensor:
     return gain * violation if gain > 0 else th.zeros_like(violation)
 
 
+def _check_form(shape: Any, agent_scaling: Any) -> None:
+    sizes = shape if isinstance(shape, (tuple, list, th.Size)) else ()
+    if len(sizes) != 2 or not all(isinstance(size, int) and size >= 0 for size in sizes):
+        raise TypeError(f"multipliers: shape is {shape!r}; expected two whole numbers (K, M)")
+    if not isinstance(agent_scaling, bool):
+        raise TypeError(f"multipliers: agent_scaling is {agent_scaling!r}; expected True or False")
+
+
 def _check(initial: float, maximum: float, **gains: float) -> None:
     for name, value in {"initial": initial, "maximum": maximum, **gains}.items():
-        if not isinstance(value, Real) or not value >= 0 or _LARGEST < value < math.inf:
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        if not is_number or not value >= 0 or _LARGEST < value < math.inf:
             raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")
     if not math.isfinite(initial) or initial > maximum:
         raise ValueError(

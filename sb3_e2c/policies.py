@@ -318,9 +318,7 @@ class TeamPolicy(ActorCriticPolicy):
         self, features: th.Tensor, critic_states: th.Tensor, sequences: Sequences | None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """Values (B, N), cost values (B, K, M), and the last hidden layers of both critics."""
-        joint = features.reshape(len(critic_states), -1)
-        if self.critic_state_dim:
-            joint = th.cat([joint, critic_states], dim=1)
+        joint = self._joint_features(features, critic_states)
         value_latent = self._value_latent(joint, sequences)
         values = self.value_net(value_latent)
         by_step = (len(joint), self.n_parties, -1)
@@ -330,6 +328,11 @@ class TeamPolicy(ActorCriticPolicy):
         cost_latent = self._cost_latent(joint if self.n_parties == 1 else features, sequences)
         cost_values = self.cost_net(cost_latent)
         return values, cost_values.view(by_step), value_latent[:, None], cost_latent.view(by_step)
+
+    def _joint_features(self, features: th.Tensor, critic_states: th.Tensor) -> th.Tensor:
+        """What joint critics see, shape (B, joint_dim), from the features (B·N, F)."""
+        joint = features.reshape(len(critic_states), -1)
+        return th.cat([joint, critic_states], dim=1) if self.critic_state_dim else joint
 
     def _actor_latent(self, features: th.Tensor, sequences: Sequences | None) -> th.Tensor:  # noqa: ARG002
         """Last hidden layer of the actor, from local features (B·N, F)."""

@@ -97,3 +97,21 @@ def random_groups(cut: Cut, n_team_steps: int) -> Iterator[Cut]:
     for chosen in np.array_split(np.random.permutation(len(cut.worlds)), n_groups):
         chosen.sort()  # keeps the longest first
         yield Cut(*(field[chosen] for field in cut))
+
+
+def alternate(sequences: Sequences) -> list[tuple[th.Tensor, Sequences]]:
+    """Divide sequences among two, every other one, so that both halves have long and short ones.
+
+    :param sequences: k sequences, longest first
+    :return: Rows of each half, and its sequences; one half if there is a single sequence
+    """
+    sizes = sequences.batch_sizes
+    starts = th.repeat_interleave(sizes.cumsum(0) - sizes, sizes)
+    parity = (th.arange(int(sizes.sum())) - starts) % 2
+    parts = []
+    for half in (0, 1):
+        own = (sizes + 1 - half) // 2
+        memory = Memory(*(states[half::2] for states in sequences.initial))
+        rows = th.nonzero(parity == half).squeeze(1)
+        parts.append((rows, Sequences(own[own > 0], memory)))
+    return [part for part in parts if len(part[0])]

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PURE = {"entropy", "constraints", "multipliers", "returns", "losses", "bounds"}
+PURE = {
+    *("entropy", "constraints", "multipliers", "returns", "losses", "objective", "ratings"),
+    "bounds",
+}
 LIBRARY = sorted((ROOT / "sb3_e2c").glob("*.py"))
 ENVS = sorted((ROOT / "envs").rglob("*.py"))
 

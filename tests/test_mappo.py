@@ -421,7 +421,7 @@ class TestGoingOn:
             model.learn(32 * 20)
             buffer = model.rollout_buffer
             errors.append(np.square(buffer.values - buffer.returns).mean())
-        assert errors[1] < 10 * errors[0]
+        assert max(errors) < 30_000  # 50,000 and more if the clip has the units of the returns
 
 
 class TestEntropy:

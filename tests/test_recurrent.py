@@ -245,7 +245,7 @@ def test_a_gru_remembers_what_an_mlp_cannot(policy, low, high):
     # guessing earns 1/2 for each of two agents
     env = share_parameters(Cue, n_worlds=16)
     model = MAPPO(
-        policy, env, n_steps=7, batch_size=10_000, n_epochs=10, gamma=1.0, learning_rate=3e-3,
+        policy, env, n_steps=7, batch_size=10_000, n_epochs=10, gamma=1.0, learning_rate=1e-3,
         policy_kwargs={"net_arch": [32]}, device="cpu", seed=0,
     )  # fmt: skip
     model.learn(20_000)

@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import strategies as st
 
@@ -13,7 +14,7 @@ pytest.importorskip("rl_zoo3")
 if sys.platform != "linux":
     pytest.skip("kills processes and reads /proc", allow_module_level=True)
 
-from torture import crash, fuzz, soak, untrusted
+from torture import crash, fuzz, hub, soak, untrusted
 from torture.runs import PREY, flags, results, run_in, trained, wait
 
 from sb3_e2c.zoo import build, train
@@ -119,6 +120,9 @@ def test_payloads_are_live_and_trust_executes_them(stranger, tmp_path):
         (f"{PREY}/vecnormalize.pkl", "enjoy"),
         ("resume points", "enjoy"),
         ("config.yml: callback", "plot"),
+        ("config.yml: callback", "train -i FILE"),
+        (f"{PREY}.zip: data", "train -i FILE"),
+        (f"{PREY}.adversary.zip: data", "train -i FILE"),
     ],
 )
 def test_no_payload_is_executed(stranger, tmp_path, place, command):
@@ -135,7 +139,9 @@ LIES += ["bomb: a YAML that is itself", "bomb: networks"]
 
 @pytest.mark.parametrize("lie", LIES)
 def test_archives_and_yaml_that_lie_are_refused_in_one_line(stranger, tmp_path, lie):
-    assert tried(stranger, tmp_path, untrusted.lies()[lie], "enjoy") == {"enjoy": "refused"}
+    commands = ("enjoy", "train -i FILE")
+    found = tried(stranger, tmp_path, untrusted.lies()[lie], *commands)
+    assert found == dict.fromkeys(commands, "refused")
 
 
 def test_a_bomb_would_be_seen(stranger, tmp_path, monkeypatch):
@@ -144,14 +150,11 @@ def test_a_bomb_would_be_seen(stranger, tmp_path, monkeypatch):
     assert tried(stranger, tmp_path, spoil, "enjoy") == {"enjoy": "memory"}
 
 
-@pytest.mark.parametrize("flag", ["--resume", "-i"])
-def test_a_run_from_the_hub_is_unpickled_only_if_it_is_trusted(stranger, tmp_path, capsys, flag):
+def test_a_run_from_the_hub_is_resumed_only_if_it_is_trusted(stranger, tmp_path, capsys):
     logs = shutil.copytree(stranger, tmp_path / "logs")
     run = run_in(logs)
     untrusted._change(run / PREY / "args.yml", repo_id="somebody/prey", trust=True)
-    what = run if flag == "--resume" else run / f"{PREY}.zip"
-    argv = [flag, str(what)]
-    argv += ["--env", PREY, "-f", str(logs)] if flag == "-i" else []
+    argv = ["--resume", str(run)]
     with pytest.raises(SystemExit):
         train.main(argv)
     (line,) = capsys.readouterr().err.strip().splitlines()
@@ -159,7 +162,65 @@ def test_a_run_from_the_hub_is_unpickled_only_if_it_is_trusted(stranger, tmp_pat
     assert train.train([*argv, "--trust", "-n", "900", "--verbose", "0"]).exists()
 
 
+# ---------------------------------------------------------------------------- a hostile hub
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory):
+    return hub.published(tmp_path_factory.mktemp("team"))
+
+
+SENDS = ["more than listed", "nothing after a while", "half of it, as if whole", "a gzip bomb"]
+SENDS += ["a byte at a time", "other bytes of the same size", "a redirection to a local file"]
+
+
+@pytest.mark.parametrize("name", SENDS)
+def test_what_a_hub_sends_is_what_it_lists_or_refused_in_one_line(team, tmp_path, name):
+    server = hub.Hub(team, send=hub.of_model(hub.SENDS[name]))
+    assert hub.attempt(server, tmp_path, tmp_path / "executed") == "refused"
+
+
+@pytest.mark.parametrize("name", ["a slip", "a size in words", "another sha256", "deep JSON"])
+def test_what_a_hub_lists_makes_sense_or_is_refused_in_one_line(team, tmp_path, name):
+    server = hub.Hub(team, hub.LISTINGS[name])
+    assert hub.attempt(server, tmp_path, tmp_path / "executed") == "refused"
+
+
+def test_an_honest_hub_is_loaded_from(team, tmp_path):
+    assert hub.attempt(hub.Hub(team), tmp_path, tmp_path / "executed") == "works"
+
+
 # ---------------------------------------------------------------------------- soak
+
+
+def test_growth_is_found_in_noise_and_noise_is_no_growth():
+    times, noise = np.linspace(0, 1000, 360), np.random.default_rng(0).normal(0, 5, 360)
+    still, error = soak.growth(times, 400 + noise)
+    assert abs(still) < 4 * error
+    growing, error = soak.growth(times, 400 + 0.02 * times + noise)  # 20 MiB
+    assert growing == pytest.approx(20, abs=4 * error)
+    assert growing > 3 * error
+
+
+def test_what_grows_is_reported(tmp_path, capsys):
+    rows = np.zeros((60, len(soak.COLUMNS)))
+    columns = dict(zip(soak.COLUMNS, rows.T, strict=True))
+    columns["seconds"][:], columns["evaluations"][:] = np.arange(60), 1
+    columns["agent_steps"][:], columns["handles"][:] = 1000 * np.arange(60), np.arange(60)
+    path = tmp_path / "test.csv"
+    np.savetxt(path, rows, delimiter=",", header=",".join(soak.COLUMNS), comments="")
+    assert soak.report("test", path) is True
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "GROWS" in line]
+    assert "handles" in line
+    columns["handles"][:] = 8
+    np.savetxt(path, rows, delimiter=",", header=",".join(soak.COLUMNS), comments="")
+    assert soak.report("test", path) is False
+
+
+def test_arrays_that_an_object_holds_are_counted_once():
+    inner = {"a": np.zeros(10), "b": [np.zeros(5, np.int8), b"abc"]}
+    inner["self"] = inner
+    assert soak.held([inner, inner["a"], int]) == 80 + 5 + len(b"abc")
 
 
 def test_a_long_training_does_not_grow(tmp_path):

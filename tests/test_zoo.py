@@ -383,6 +383,19 @@ def test_the_same_seed_trains_the_same_team(trained, tmp_path):
         assert one.equal(other)
 
 
+@pytest.mark.parametrize("column", ["r", "cost"])
+def test_a_learning_curve_of_damaged_numbers_is_refused(copy, column):
+    path = run_folder(copy) / "monitor.csv"
+    heading, *rows = path.read_text().splitlines()
+    names = rows[0].split(",")
+    broken = [row.split(",") for row in rows[1:]]
+    for row in broken:
+        row[names.index(column)] = "x"
+    path.write_text("\n".join([heading, rows[0], *(",".join(row) for row in broken)]))
+    with pytest.raises(UserError, match=r"monitor.csv or progress.csv is damaged"):
+        plot_learning(run_folder(copy))
+
+
 def test_continuing_goes_on_with_counters_and_configuration(copy):
     start = run_folder(copy) / f"{ENV}.zip"
     argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(start), "--seed", "2"]
@@ -392,6 +405,42 @@ def test_continuing_goes_on_with_counters_and_configuration(copy):
     config = read_yaml(run / ENV / "config.yml")
     assert (config["n_envs"], config["n_epochs"]) == (2, 2)  # of the first run; of the user
     assert pd.read_csv(run / "progress.csv")["time/total_timesteps"].iloc[-1] == 3 * ROLLOUT
+
+
+def test_continuing_from_numbers_alone_is_what_unpickling_would_do(copy):
+    start = run_folder(copy) / f"{ENV}.zip"
+    argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(start), "--seed", "2"]
+    argv += ["--eval-freq", "-1", "--verbose", "0"]
+    plain, trusted = (
+        E2CMAPPO.load(train.train([*argv, *more]) / f"{ENV}.zip", device="cpu")
+        for more in ([], ["--trust"])
+    )
+    assert plain._n_updates == trusted._n_updates > 0
+    for name, tensor in trusted.policy.state_dict().items():
+        assert tensor.equal(plain.policy.state_dict()[name]), name
+
+
+def test_continuing_without_the_run_around_the_model_needs_the_same_networks(
+    copy, tmp_path, capsys
+):
+    alone = tmp_path / "alone.zip"
+    shutil.copy(run_folder(copy) / f"{ENV}.zip", alone)
+    argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(alone), "--verbose", "0"]
+    assert "does not fit" in refusal(capsys, train.main, argv)
+
+
+@pytest.mark.parametrize("steps", [-1, 1.5, None, True, "1", [], 2**63])
+def test_continuing_refuses_a_model_that_was_trained_for_no_number_of_steps(copy, capsys, steps):
+    start = run_folder(copy) / f"{ENV}.zip"
+    with zipfile.ZipFile(start) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["data"] = json.dumps({**json.loads(members["data"]), "num_timesteps": steps})
+    with zipfile.ZipFile(start, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    argv = ["--env", ENV, "-n", str(ROLLOUT), "-f", str(copy), "-i", str(start), "--verbose", "0"]
+    line = refusal(capsys, train.main, argv)
+    assert f"num_timesteps is {steps}; expected a number of steps" in line
 
 
 def test_a_continued_run_may_change_the_critics_learning_rate(copy):

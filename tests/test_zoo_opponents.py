@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.save_util import load_from_zip_file
 
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("mpe2")
@@ -133,6 +134,21 @@ def test_continuing_brings_the_adversary_along(trained, tmp_path):
     model = trained / "e2c_t" / f"{ENV}_1" / f"{ENV}.zip"
     folder = run_train(tmp_path, "-i", str(model), steps=ROLLOUT)
     assert (folder / f"{ENV}.adversary.zip").exists()
+
+
+def test_continuing_from_numbers_alone_is_what_unpickling_would_do(trained, tmp_path):
+    model = trained / "e2c_t" / f"{ENV}_1" / f"{ENV}.zip"
+    for_both = ["-i", str(model), "--seed", "2", "--eval-freq", "-1"]
+    folders = [
+        run_train(tmp_path / name, *for_both, *more, steps=ROLLOUT)
+        for name, more in (("plain", []), ("trusted", ["--trust"]))
+    ]
+    for name in (f"{ENV}.zip", f"{ENV}.adversary.zip"):
+        plain, trusted = (load_from_zip_file(each / name, device="cpu") for each in folders)
+        assert plain[0]["_n_updates"] == trusted[0]["_n_updates"] > 0
+        assert plain[0]["num_timesteps"] == trusted[0]["num_timesteps"]
+        for key, tensor in trusted[1]["policy"].items():
+            assert tensor.equal(plain[1]["policy"][key]), (name, key)
 
 
 def test_opponents_are_refused_where_nobody_plays_against_the_team(tmp_path, capsys):

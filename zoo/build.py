@@ -2,9 +2,11 @@
 
 import contextlib
 import itertools
+import json
 import math
 import os
 import pickle
+import zipfile
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -18,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c import MAPPO, share_parameters
 from sb3_e2c.envs import ENV_IDS
+from sb3_e2c.opponents import adversary_path
 from sb3_e2c.vec_env import MultiAgentVecEnv, OpponentVecEnv
 from sb3_e2c.zoo.archives import check_archive
 from sb3_e2c.zoo.configuration import ALGORITHMS, ZOO_KEYS
@@ -171,6 +174,37 @@ def load_weights(model: MAPPO, path: str | Path) -> None:
             f"{path} does not fit; was it trained with another algorithm or environment? "
             f"{brief(error)}"
         ) from error
+
+
+def go_on_from(model: MAPPO, path: str | Path) -> None:
+    """Give a model, and the adversary that learns beside it, what ``model.save`` wrote.
+
+    Like ``MAPPO.load``, but only numbers are read: nothing that the file holds is executed.
+
+    :param model: An untrained model of the same algorithm, networks and team
+    :param path: Its zip file
+    :raises UserError: if a file is missing, broken, or belongs to another kind of model
+    """
+    beside = adversary_path(path)
+    _continue(model, path)
+    model._adversary_file = beside  # saved again with the team, if somebody else acts now
+    if model.opponent is not None:
+        _continue(model.opponent, beside)
+
+
+def _continue(model: MAPPO, path: str | Path) -> None:
+    load_weights(model, path)
+    check_finite(model, path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+        counters = {name: data[name] for name in ("num_timesteps", "_n_updates")}
+    except Exception as error:  # whatever broken content makes its readers raise
+        raise UserError(f"{path} does not say how far it was trained: {brief(error)}") from error
+    for name, number in counters.items():
+        if type(number) is not int or not 0 <= number < 2**63:
+            raise UserError(f"{path}: {name} is {brief(number)}; expected a number of steps")
+        setattr(model, name, number)
 
 
 def _largest_file(model: MAPPO) -> int:

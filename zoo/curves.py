@@ -83,7 +83,7 @@ def _curve(
     label: str | None = None,
     alpha: float = 1.0,
 ) -> None:
-    window = values.rolling(WINDOW, min_periods=1)
+    window = values.astype(float).rolling(WINDOW, min_periods=1)
     mean, error = window.mean(), window.std().fillna(0.0) / np.sqrt(window.count())
     axes.plot(steps, mean, color=color, label=label, alpha=alpha)
     axes.fill_between(steps, mean - error, mean + error, color=color, alpha=0.2, linewidth=0)

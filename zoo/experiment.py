@@ -6,6 +6,7 @@ import shlex
 import signal
 import warnings
 from argparse import Namespace
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from pprint import pprint
@@ -33,7 +34,9 @@ from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.build import (
     build_model,
     check_finite,
+    check_networks,
     constructor_arguments,
+    go_on_from,
     load_opponent,
     make_worlds,
     refusals_of,
@@ -85,6 +88,7 @@ def configure(args: Namespace) -> dict[str, Any]:
         _conf_file(args), {"env_kwargs": args.env_kwargs or {}}, args.hyperparams or {}
     )
     base = _continued_configuration(args)
+    _check_callback(args, base or {}, overrides)
     config = resolve(args.algo, args.env, parse_presets(args.preset), overrides, base)
     if base is not None:
         _check_changes(base, config)
@@ -110,6 +114,15 @@ def _continued_configuration(args: Namespace) -> dict[str, Any] | None:
     if algo != args.algo:
         raise UserError(f"-i {args.trained_agent} was trained with --algo {algo}, not {args.algo}")
     return read_yaml(saved / "config.yml")
+
+
+def _check_callback(args: Namespace, old: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
+    """Refuse to run code that a file from elsewhere may have named."""
+    if old.get("callback") and "callback" not in overrides and not args.trust:
+        raise UserError(
+            f"-i: the run's config.yml names a callback, {brief(old['callback'])}, which is code; "
+            "say --trust if you want it to run, or -params callback:null to do without"
+        )
 
 
 def _check_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
@@ -225,11 +238,23 @@ class TeamExperimentManager(ExperimentManager):
     def _new_or_continued(self, config: dict[str, Any], env: VecEnv, flags: Any) -> MAPPO:
         if not self.continue_training:
             return build_model(self.algo, config, env, **flags)
+        try:
+            if self.args.trust:
+                return self._trusted(config, env, flags)
+            check_networks(config, self.trained_agent)
+            model = build_model(self.algo, config, env, **flags)
+            go_on_from(model, self.trained_agent)
+        except UserError as error:
+            raise UserError(f"cannot continue from {self.trained_agent}: {error}") from error
+        return model
+
+    def _trusted(self, config: dict[str, Any], env: VecEnv, flags: dict[str, Any]) -> MAPPO:
+        """Stable-Baselines3's own loading, which executes what the file says."""
         changes = constructor_arguments({k: config[k] for k in _CHANGEABLE if k in config})
         try:
             model = ALGORITHMS[self.algo].load(self.trained_agent, env=env, **flags, **changes)
         except Exception as error:  # whatever a broken or foreign pickle may raise
-            raise UserError(f"cannot continue from {self.trained_agent}: {brief(error)}") from error
+            raise UserError(brief(error)) from error
         check_finite(model, self.trained_agent)
         return model
 

@@ -4,8 +4,10 @@ It becomes the next run of its method and task in the log folder, for sb3-e2c en
 export. Only files of known names and bounded sizes are fetched, and nothing in them is executed.
 """
 
+import hashlib
 import sys
 import tempfile
+import time
 import zipfile
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from huggingface_hub import HfApi, snapshot_download
-from huggingface_hub.hf_api import ModelInfo
+from huggingface_hub import HfApi, hf_hub_url
+from huggingface_hub.hf_api import ModelInfo, RepoSibling
+from huggingface_hub.utils import build_hf_headers, get_session, hf_raise_for_status
 from rl_zoo3.utils import get_latest_run_id
 
 from sb3_e2c.zoo.archives import check_archive, is_inside
@@ -33,6 +36,8 @@ from sb3_e2c.zoo.push import PUBLIC_ARGS, plain_yaml
 
 _CONFIGURATION = ("config.yml", "args.yml")
 _DEEPEST = 20  # levels of YAML
+_SILENCE = 20.0  # seconds until a server that says nothing is given up
+_PATIENCE, _SLOWEST = 30.0, 1024  # seconds at the start; bytes a second on average after them
 _OPENING = (
     *(yaml.BlockMappingStartToken, yaml.BlockSequenceStartToken),
     *(yaml.FlowMappingStartToken, yaml.FlowSequenceStartToken),
@@ -67,16 +72,19 @@ def load(args: Namespace) -> Path:
     check_writable(args.folder, "--folder")
     fetched_from = f"cannot load {args.repo_id}"
     with hub_errors(fetched_from):
-        info = HfApi().model_info(args.repo_id, revision=args.revision, files_metadata=True)
+        info = HfApi().model_info(
+            args.repo_id, revision=args.revision, files_metadata=True, timeout=_SILENCE
+        )
     try:
         names = files_of_a_team(info)
         args.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".load-", dir=args.folder) as temporary:
             place = Path(temporary)
-            with hub_errors("download"):
-                snapshot_download(
-                    args.repo_id, revision=info.sha, allow_patterns=names, local_dir=place / "hub"
-                )
+            listed = {file.rfilename: file for file in info.siblings or []}
+            (place / "hub").mkdir()
+            for name in names:
+                with hub_errors(f"download of {name}"):
+                    fetch(args.repo_id, info.sha, listed[name], place / "hub" / name)
             check_files(place / "hub", names)
             source = {"repo_id": args.repo_id, "revision": info.sha}
             return _arrange(place / "hub", place / "run", names, args.folder, source)
@@ -106,9 +114,48 @@ def files_of_a_team(info: ModelInfo) -> list[str]:
     return names
 
 
+def fetch(repo_id: str, revision: str | None, file: RepoSibling, path: Path) -> None:
+    """Download a file, but no more, and nothing else, than its repository lists.
+
+    The hub's own client would wait for ever for a server that breaks off again and again.
+
+    :param repo_id: The repository
+    :param revision: Its commit
+    :param file: What the hub lists: name, size, and a checksum
+    :param path: Where it shall lie
+    :raises UserError: if something else arrives, or hardly anything
+    """
+    size, start = file.size or 0, time.monotonic()
+    url, headers = hf_hub_url(repo_id, file.rfilename, revision=revision), build_hf_headers()
+    options: dict[str, Any] = {"follow_redirects": True, "timeout": _SILENCE}
+    hashes = {"sha256": hashlib.sha256(), "git": hashlib.sha1(b"blob %d\0" % size)}
+    with (
+        get_session().stream("GET", url, headers=headers, **options) as answer,
+        path.open("wb") as to,
+    ):
+        hf_raise_for_status(answer)
+        for chunk in answer.iter_bytes():
+            to.write(chunk)
+            for each in hashes.values():
+                each.update(chunk)
+            if to.tell() > size:
+                raise UserError(f"more arrives than the {size:,} bytes that are listed")
+            if time.monotonic() - start > _PATIENCE + to.tell() / _SLOWEST:
+                raise UserError(f"it arrives at less than {_SLOWEST} bytes a second; try later")
+    _check_arrived(file, path.stat().st_size, {k: v.hexdigest() for k, v in hashes.items()})
+
+
+def _check_arrived(file: RepoSibling, size: int, found: Mapping[str, str]) -> None:
+    if size != file.size:
+        raise UserError(f"{size:,} of {file.size:,} bytes have arrived; try again")
+    kind, listed = ("sha256", file.lfs.sha256) if file.lfs else ("git", file.blob_id)
+    if listed is not None and listed != found[kind]:
+        raise UserError(f"its checksum is {found[kind]}, but {listed} is listed; try again")
+
+
 def _check_size(name: str, size: int | None) -> None:
-    if size is None or size > LARGEST[name]:
-        found = "an unknown number of" if size is None else f"{size:,}"
+    if not isinstance(size, int) or not 0 <= size <= LARGEST[name]:
+        found = f"{size:,}" if isinstance(size, int) else "an unknown number of"
         raise UserError(f"{name} has {found} bytes; expected at most {LARGEST[name]:,}")
 
 
@@ -127,11 +174,21 @@ def check_files(folder: Path, names: Sequence[str]) -> None:
         if path.suffix in (".zip", ".npz"):
             try:
                 check_archive(path, LARGEST[name])
+                if path.suffix == ".zip":
+                    _check_model(path)
             except Exception as error:  # whatever zip files raise for broken content
                 raise UserError(f"{name}: {brief(error)}") from error
     statistics = folder / "model.vecnormalize.npz"
     if statistics.name in names:
         _check_numbers(statistics)
+
+
+def _check_model(path: Path) -> None:
+    """Of a file that was cut off, an archive inside it may be left."""
+    with zipfile.ZipFile(path) as archive:
+        missing = {"data", "policy.pth"} - set(archive.namelist())
+    if missing:
+        raise ValueError(f"it has no {sorted(missing)[0]}, as a saved model has")
 
 
 def _check_numbers(path: Path) -> None:

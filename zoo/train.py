@@ -64,7 +64,7 @@ _CHANGED_FLAGS: dict[str, dict[str, Any]] = {
     "--save-freq": {"help": "Save the team every n agent steps (if negative, no checkpoint)"},
     "--eval-episodes": {"help": "Number of world episodes to use for evaluation"},
     "--n-eval-envs": {"help": "Number of worlds for evaluation"},
-    "--trained-agent": {"help": "Continue training this .zip (of your own: it is unpickled)"},
+    "--trained-agent": {"help": "Continue training this .zip, from which only numbers are read"},
     "--conf-file": {"help": "YAML file of hyperparameters, by environment ID or 'default'"},
     "--hyperparams": {
         **_PAIRS,
@@ -159,8 +159,9 @@ class TrainParser(ConsoleParser):
         self.add_argument(
             "--trust",
             action="store_true",
-            help="With -i or --resume of a run that sb3-e2c load has fetched: unpickle it, which "
-            "can execute what its author has put there",
+            help="Let a file execute what its author has put there: -i loads it as "
+            "Stable-Baselines3 does, by unpickling, with the callback in its config.yml; --resume "
+            "also takes a run that sb3-e2c load has fetched",
         )
         defaults = vars(super().parse_args([]))
         unset = object()
@@ -214,14 +215,12 @@ def _check(args: argparse.Namespace) -> None:
 
 def _check_own(args: argparse.Namespace) -> None:
     """Refuse to unpickle what ``load`` has fetched, unless its author is trusted."""
-    continued = args.trained_agent and Path(args.trained_agent).parent
-    for flag, run in (("--resume", args.resume), ("-i", continued)):
-        saved = Path(run, args.env, "args.yml")
-        if run and not args.trust and saved.is_file() and "repo_id" in read_yaml(saved):
-            raise UserError(
-                f"{flag}: {run} was fetched from the hub, and to go on with it is to unpickle it, "
-                "which can execute what its author has put there; say --trust if you want that"
-            )
+    saved = Path(args.resume, args.env, "args.yml")
+    if args.resume and not args.trust and saved.is_file() and "repo_id" in read_yaml(saved):
+        raise UserError(
+            f"--resume: {args.resume} was fetched from the hub, and to resume it is to unpickle "
+            "it, which can execute what its author has put there; say --trust if you want that"
+        )
 
 
 def _import_packages(names: Sequence[str]) -> None:

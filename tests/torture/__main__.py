@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch as th
 
-from torture import crash, fuzz, soak, untrusted
+from torture import crash, fuzz, hub, soak, untrusted
 
 
 def trials(folder, long):
@@ -26,6 +26,7 @@ def trials(folder, long):
 
     yield from crash.torture(place(), 600 if long else 100, 50 if long else 8)
     yield from untrusted.torture(place(), long)
+    yield from hub.torture(place())
     yield from soak.torture(place(), 2000 if long else 200)
     yield from fuzz.torture(place(), 10_000 if long else 1500)
 

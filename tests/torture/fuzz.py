@@ -6,6 +6,7 @@ ValueError or TypeError that is raised by us or by Stable-Baselines3, not deep i
 
 import argparse
 import contextlib
+import inspect
 import io
 import os
 import signal
@@ -13,12 +14,14 @@ import traceback
 import warnings
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import torch as th
 import yaml
 from conftest import TwoOnALine
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_e2c import (
     E2CMAPPO,
@@ -45,7 +48,7 @@ from sb3_e2c.zoo import (
     train,
     tune,
 )
-from sb3_e2c.zoo.build import build_model, load_weights, make_worlds
+from sb3_e2c.zoo.build import build_model, go_on_from, load_weights, make_worlds
 from sb3_e2c.zoo.configuration import ALGORITHMS, keys, preset_names
 from sb3_e2c.zoo.console import UserError, one_line_errors
 from sb3_e2c.zoo.curves import plot_learning
@@ -56,7 +59,7 @@ from sb3_e2c.zoo.runs import find_run, load_model, make_env, open_run
 from torture.runs import PREY, Outcome, quietly, trained
 
 SECONDS = 30  # of a case; longer is a hang
-OURS = f"{os.sep}sb3_e2c{os.sep}", f"{os.sep}stable_baselines3{os.sep}"
+OURS = [f"{os.sep}{name}{os.sep}" for name in ("sb3_e2c", "stable_baselines3", "gymnasium")]
 
 
 class Hang(BaseException):
@@ -408,11 +411,24 @@ def try_building(case):
 numbers = st.one_of(
     st.integers(-2, 8),
     st.floats(allow_nan=True, allow_infinity=True),
-    st.sampled_from([0.5, 0.0, 1.0, 10**400, True, np.float32(0.5), np.int64(3), np.array(2.0)]),
+    st.sampled_from([0.5, 0.0, 1.0, 10**400, 2**63, True, th.tensor(0.5)]),
+    st.sampled_from(
+        [np.float32(0.5), np.int64(3), np.array(2.0), np.bool_(True), np.float64("nan")]
+    ),
     st.sampled_from([None, "a", "", [], {}, [1, 2], (), "lin_0.1", b"a", len, float, object()]),
 )
+optimizer_kwargs = st.dictionaries(
+    st.sampled_from(["eps", "betas", "lr", "a"]), numbers, max_size=2
+)
+schedules = st.sampled_from([LinearSchedule(0.3, 0.0, 1.0), LinearSchedule(0.1, -0.1, 1.0), abs])
 SENSIBLE = {
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size"), st.integers(1, 8)),
+    **dict.fromkeys(("learning_rate", "critic_learning_rate"), schedules),
+    **dict.fromkeys(("clip_range", "clip_range_vf"), schedules),
+    **dict.fromkeys(("normalize_advantage", "normalize_values"), st.booleans()),
+    "device": st.sampled_from(["auto", "cpu", "cuda", "cuda:9", "meta", "mps", th.device("cpu")]),
+    "seed": st.integers(0, 2**33),
+    "tensorboard_log": st.sampled_from([None, "tensorboard", Path("tensorboard")]),
     "cost_limits": st.sampled_from([None, 1.0, [2.0], []]),
     "cost_scope": st.sampled_from(["team", "individual"]),
     "multipliers_class": st.sampled_from([GradientMultipliers, PIDMultipliers]),
@@ -423,8 +439,14 @@ SENSIBLE = {
     ),
     "policy": st.sampled_from(["MlpPolicy", "GruPolicy", "CnnPolicy", int]),
     "policy_kwargs": st.dictionaries(
-        st.sampled_from(["net_arch", "activation_fn", "gru_hidden_size", "ortho_init", "a"]),
-        numbers | st.lists(st.integers(-1, 4), max_size=2),
+        st.sampled_from(
+            [
+                *("net_arch", "activation_fn", "gru_hidden_size", "ortho_init", "log_std_init"),
+                *("optimizer_class", "optimizer_kwargs", "features_extractor_class", "a"),
+                *("share_features_extractor", "squash_output", "use_sde", "normalize_images"),
+            ]
+        ),
+        numbers | st.lists(st.integers(-1, 4), max_size=2) | optimizer_kwargs,
         max_size=2,
     ),
     "oem_kwargs": st.dictionaries(
@@ -433,12 +455,8 @@ SENSIBLE = {
         max_size=3,
     ),
 }
-# Those that Stable-Baselines3 or torch would have to check are left to them.
-MODEL_ARGUMENTS = [
-    *("policy", "policy_kwargs", "n_steps", "batch_size", "n_epochs", "cost_limits", "cost_scope"),
-    *("multipliers_class", "multipliers_kwargs", "opponent_kwargs", "normalize_values"),
-    *("oem_kwargs", "verbose"),
-]
+MODEL_ARGUMENTS = [*inspect.signature(MAPPO).parameters, "oem_kwargs"]
+MODEL_ARGUMENTS.remove("_init_setup_model")
 
 
 def arguments(names, most=3):
@@ -450,13 +468,31 @@ def arguments(names, most=3):
     )
 
 
-def clear(act):
-    """None if it works, or refuses clearly; else what is wrong."""
+def clear(act, given=None):
+    """None if it works, or refuses clearly; else what is wrong.
+
+    :param act: Calls a constructor
+    :param given: Its odd arguments; the message has to name one, or an argument inside one
+    """
     try:
         act()
-    except (ValueError, TypeError) as error:
-        return _unclear(error)
+    except (ValueError, TypeError, gymnasium.error.Error) as error:
+        return _unclear(error) or _nameless(str(error).lower(), given)
     return None
+
+
+def _nameless(message, given):
+    names = [name for each in (given or {}).items() for name in _names(*each)]
+    others = ["missing", "training stops"]  # what is missing; numbers that are large in effect
+    if given is None or any(name in message for name in [*names, *others]):
+        return None
+    return f"names none of its arguments: {message[:100]}"
+
+
+def _names(name, value):
+    """An argument's name as in its messages ("policy_class", "high"), and of those inside."""
+    inner = [str(key) for key in value] if isinstance(value, dict) else []
+    return [name.lower(), name.removesuffix("_kwargs"), *inner]
 
 
 def _unclear(error):
@@ -474,17 +510,17 @@ def try_model(case):
 
     def act():
         with contextlib.redirect_stdout(io.StringIO()):
-            model = kind(env=env, **{**small, **kwargs})
+            model = kind(**{"env": env, **small, **kwargs})
         if model.n_steps < 100 and model.n_epochs < 100:
             with contextlib.redirect_stdout(io.StringIO()):
                 model.learn(1)
 
-    return clear(act)
+    return clear(act, kwargs)
 
 
 def try_part(case):
     kind, kwargs = case
-    return clear(lambda: kind(**kwargs))
+    return clear(lambda: kind(**kwargs), kwargs)
 
 
 def try_worlds(kwargs):
@@ -596,8 +632,32 @@ class Files:
             path.write_bytes(content)
         return None
 
+    def sweep(self, n):
+        """Flip a bit in every region of the archives, and cut them there.
+
+        :param n: How many cases in all
+        :return: A line of the table
+        """
+        wrong, step = [], 4 / max(n, 4)
+        cases = [
+            (name, (how, number * step, number, b"\0"))
+            for name in (f"{PREY}.zip", f"{PREY}.adversary.zip")
+            for how in ("flip", "cut")
+            for number in range(n // 4)
+        ]
+        for case in cases:
+            try:
+                with deadline():
+                    self.try_one(case)
+            except (Hang, Exception) as error:
+                wrong.append(f"{type(error).__name__} in {_place(error)}: {case}")
+        return Outcome(
+            "archives, flipped and cut in every region", len(cases), 0, len(wrong), tuple(wrong)
+        )
+
     def _model(self, path):
         load_weights(self.model, path)
+        go_on_from(self.model, path)
         assert all(th.equal(v, self.weights[k]) for k, v in self.model.policy.state_dict().items())
 
     def _opponent(self, path):
@@ -605,6 +665,7 @@ class Files:
         from sb3_e2c.zoo.build import load_opponent
 
         load_opponent(self.model, opponent_env(self.env), path)
+        go_on_from(self.model, self.run / f"{PREY}.zip")
 
     def _statistics(self, path):
         load_statistics(self.env.venv, path)
@@ -648,22 +709,23 @@ def _torture(run, n):
         [st.tuples(st.just(name), argv_of(every[name][0])) for name in every]
         + [st.tuples(st.just("train"), argv_of(every["train"][0]))] * 4
     )
-    yield fuzz("command lines", lines, lambda c: one_line(every[c[0]][1](c[1])), int(0.35 * n))
+    yield fuzz("command lines", lines, lambda c: one_line(every[c[0]][1](c[1])), int(0.33 * n))
     strange = st.lists(words, max_size=3).filter(lambda argv: argv[:1] != ["demo"])
     yield fuzz("commands", strange, lambda a: one_line(quietly(cli.main, a)), int(0.02 * n))
     texts = yamls(st.fixed_dictionaries({PREY: configurations}))
-    yield fuzz("YAML: --conf-file", texts, try_conf_file, int(0.12 * n))
-    yield fuzz("YAML: suites", yamls(suites), try_suite, int(0.08 * n))
-    yield fuzz("YAML: search spaces", yamls(configurations), try_space, int(0.05 * n))
+    yield fuzz("YAML: --conf-file", texts, try_conf_file, int(0.10 * n))
+    yield fuzz("YAML: suites", yamls(suites), try_suite, int(0.06 * n))
+    yield fuzz("YAML: search spaces", yamls(configurations), try_space, int(0.04 * n))
     built = st.tuples(st.sampled_from(sorted(ALGORITHMS)), configurations)
-    yield fuzz("configurations that are built", built, try_building, int(0.08 * n))
+    yield fuzz("configurations that are built", built, try_building, int(0.06 * n))
     models = st.tuples(st.sampled_from([MAPPO, E2CMAPPO]), arguments(MODEL_ARGUMENTS))
     models = models.filter(lambda c: c[0] is E2CMAPPO or "oem_kwargs" not in c[1])
-    yield fuzz("arguments of models", models, try_model, int(0.06 * n))
-    yield fuzz("arguments of estimators, multipliers", parts, try_part, int(0.06 * n))
-    yield fuzz("arguments of share_parameters", worlds, try_worlds, int(0.06 * n))
+    yield fuzz("arguments of models", models, try_model, int(0.12 * n))
+    yield fuzz("arguments of estimators, multipliers", parts, try_part, int(0.05 * n))
+    yield fuzz("arguments of share_parameters", worlds, try_worlds, int(0.05 * n))
     files = Files(run)
     names = st.sampled_from(sorted(files.acts))
-    yield fuzz("spoiled files", st.tuples(names, spoils), files.try_one, int(0.11 * n))
+    yield fuzz("spoiled files", st.tuples(names, spoils), files.try_one, int(0.08 * n))
+    yield files.sweep(int(0.08 * n))
     names = st.sampled_from(sorted(files.slow))
     yield fuzz("spoiled logs", st.tuples(names, spoils), files.try_one, int(0.01 * n))

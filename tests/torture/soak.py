@@ -1,112 +1,244 @@
-"""A long training must not grow: memory, open files, memories of callbacks, files it writes.
+"""A long training must not grow: memory, open files, threads, what callbacks remember, its files.
 
-    PYTHONPATH=tests python -m torture.soak --env MultiRover-6-3-v0 --minutes 120 -o soak
+    PYTHONPATH=tests python -m torture.soak --minutes 120 -o soak
 
-writes soak/ENV.csv, a row every few seconds, and soak/ENV.png. Linux only: it reads /proc.
+trains E2C on rovers, with GRUs, and against an adversary, a third of the time each, and writes
+soak/NAME.csv, a row every few seconds, soak/NAME.png, and a table; exit status 1 if anything grows.
+Linux only: it reads /proc.
 """
 
 import argparse
 import csv
 import os
 import signal
+import sys
 import time
+from collections import deque
 from pathlib import Path
 
 import numpy as np
+import torch as th
 from matplotlib.figure import Figure
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_e2c import OEMRewardCallback
+from sb3_e2c import OEMRewardCallback, TeamEvalCallback
 from sb3_e2c.zoo import train
 from sb3_e2c.zoo.resume import KeepPoints
-from torture.runs import ROVERS, Outcome, flags, fork, wait
+from torture.runs import PREY, ROVERS, Outcome, flags, fork, wait
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
-COLUMNS = ("seconds", "rss_mib", "handles", "log_kib", "other_kib", "agent_steps")
+TRAININGS = {
+    "rovers": ["--env", ROVERS],
+    "gru": ["--env", ROVERS, "--preset", "gru"],
+    "adversary": ["--env", PREY],
+}
+INSIDE = ("estimator_kib", "callbacks_kib", "episodes_kept", "evaluations")
+COLUMNS = ("seconds", "rss_mib", "handles", "threads", "progress_kib", "monitor_kib", "other_kib")
+COLUMNS += ("agent_steps", *INSIDE)
+# What must not grow after the first third, and by how much it may differ all the same. RSS depends
+# on what the allocator keeps; other files are models and resume points, compressed.
+CONSTANT = {"rss_mib": 8.0, "handles": 0.5, "threads": 0.5, "other_kib": 64.0}
+CONSTANT |= {"estimator_kib": 0.1, "callbacks_kib": 64.0, "episodes_kept": 0.5}
+LOGS = 400.0  # most KiB of logs for a million agent steps
 
 
 def measure(pid="self"):
-    """Resident memory in MiB and open files of a process."""
+    """Resident memory in MiB, open files and threads of a process."""
     resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 2**20
-    return resident, len(os.listdir(f"/proc/{pid}/fd"))
+    return resident, *(len(os.listdir(f"/proc/{pid}/{name}")) for name in ("fd", "task"))
 
 
-def soak(env, minutes, out, every=5.0):
+# ---------------------------------------------------------------------------- inside the training
+
+
+def held(thing, seen=None):
+    """Bytes of arrays and strings that an object holds, without models, worlds and loggers."""
+    seen = set() if seen is None else seen
+    if id(thing) in seen or isinstance(thing, (BaseAlgorithm, VecEnv, Logger, type)):
+        return 0
+    seen.add(id(thing))
+    if isinstance(thing, (np.ndarray, th.Tensor)):
+        return thing.nbytes
+    if isinstance(thing, (bytes, bytearray, str)):
+        return len(thing)
+    inner = list(thing.values()) if isinstance(thing, dict) else getattr(thing, "__dict__", {})
+    inner = list(inner.values()) if isinstance(inner, dict) else inner
+    inner += list(thing) if isinstance(thing, (list, tuple, set, deque)) else []
+    return sum(held(each, seen) for each in inner)
+
+
+def inside(callbacks, model):
+    """The columns of ``INSIDE``; results of evaluations are kept, as Stable-Baselines3 does."""
+    found = {type(each): each for each in callbacks}
+    oem, evaluations = found[OEMRewardCallback], found[TeamEvalCallback]
+    others = [vars(each) for each in callbacks if each is not evaluations]
+    own = [{k: v for k, v in each.items() if k not in ("locals", "globals")} for each in others]
+    counts = len(model.ep_info_buffer), len(evaluations.evaluations_timesteps)
+    return held(oem.estimator) / 1024, held(own) / 1024, *counts
+
+
+def _train(argv, path, every):
+    """In a child process: train, and write down the columns of ``INSIDE``."""
+    real, last = KeepPoints._on_rollout_start, [0.0]
+
+    def on_rollout_start(self):
+        real(self)
+        if time.monotonic() - last[0] > every / 2:
+            last[0] = time.monotonic()
+            numbers = inside(_flat(self._everything.callbacks), self.model)
+            path.with_suffix(".new").write_text(" ".join(map(str, numbers)))
+            path.with_suffix(".new").replace(path)
+
+    KeepPoints._on_rollout_start = on_rollout_start
+    train.main(argv)
+
+
+def _flat(callbacks: list[BaseCallback]) -> list[BaseCallback]:
+    inner = [getattr(each, "callbacks", [each]) for each in callbacks]
+    return [each for few in inner for each in few]
+
+
+# ---------------------------------------------------------------------------- from outside
+
+
+def soak(name, minutes, out, every=5.0):
     """Train in a child process, and look at it from here.
 
+    :param name: A key of ``TRAININGS``
     :return: The csv file
     """
     out.mkdir(parents=True, exist_ok=True)
-    argv = ["--algo", "e2c_t", "--env", env, "-f", str(out / "logs"), "-n", str(10**12)]
-    argv += ["--verbose", "0", "--device", "cpu", "--eval-freq", "200000", "--eval-episodes", "10"]
-    pid = fork(train.main, argv)
-    path = out / f"{env}.csv"
+    logs, path, note = out / f"{name}_logs", out / f"{name}.csv", out / f"{name}.inside"
+    argv = [*TRAININGS[name], "--algo", "e2c_t", "-f", str(logs), "-n", str(10**12), "--verbose"]
+    argv += ["0", "--device", "cpu", "--eval-freq", "100000", "--eval-episodes", "10"]
+    argv += ["--resume-every", "10"]
+    pid = fork(_train, argv, note, every)
     try:
         with path.open("w", newline="") as file:
             table = csv.writer(file)
             table.writerow(COLUMNS)
-            for row in _samples(pid, out / "logs", env, 60 * minutes, every):
-                table.writerow(row)
+            for row in _samples(pid, logs, note, 60 * minutes, every):
+                table.writerow([round(number, 2) for number in row])
                 file.flush()
     finally:
         os.kill(pid, signal.SIGTERM)
         status = wait(pid)
+        note.unlink(missing_ok=True)
     if status != 128 + signal.SIGTERM:
         raise RuntimeError(f"the training ended with status {status}")
     return path
 
 
-def _samples(pid, logs, env, seconds, every):
+def _samples(pid, logs, note, seconds, every):
+    """Rows of the table, from the moment when there is something to see inside."""
     start = time.monotonic()
     while time.monotonic() - start < seconds:
         time.sleep(every)
         if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
             return
-        runs = sorted(logs.glob(f"*/{env}_*"), key=lambda run: int(run.name.rpartition("_")[2]))
-        sizes = _sizes(runs[-1]) if runs else {}
-        in_logs = sum(sizes.get(name, 0) for name in ("monitor.csv", "progress.csv"))
+        runs = sorted(logs.glob("*/*_*"), key=lambda run: int(run.name.rpartition("_")[2]))
+        if not note.exists() or not runs:
+            continue
+        sizes = _sizes(runs[-1])
         points = [int(name.split(".")[0]) for name in sizes if name.endswith(".point")]
-        resident, handles = measure(pid)
-        other = sum(sizes.values()) - in_logs
-        yield (
-            *(round(time.monotonic() - start, 1), round(resident, 2), handles),
-            *(round(in_logs / 1024, 1), round(other / 1024, 1), max(points, default=0)),
-        )
+        files = [sizes.pop(f"{name}.csv", 0) / 1024 for name in ("progress", "monitor")]
+        files += [sum(sizes.values()) / 1024, max(points, default=0)]
+        yield time.monotonic() - start, *measure(pid), *files, *map(float, note.read_text().split())
 
 
 def _sizes(run):
+    """Bytes of a run's files; of two resume points the newer one, of evaluations none: they add up.
+
+    A file may get its name, or lose it, while we look.
+    """
     found = {}
-    for path in run.rglob("*"):
+    for path in run.rglob("[!.]*"):
         try:
             found[path.name] = path.stat().st_size if path.is_file() else 0
-        except FileNotFoundError:  # a temporary file that has got its name
+        except FileNotFoundError:
             continue
-    return found
+    points = sorted(name for name in found if name.endswith(".point"))
+    return {k: v for k, v in found.items() if k not in ("evaluations.npz", *points[:-1])}
 
 
-def slopes(path):
-    """Growth in the second half: MiB an hour, handles, KiB of logs a million agent steps."""
+# ---------------------------------------------------------------------------- judgement
+
+
+def warm(table):
+    """Rows after the first third of the time, and after the first evaluation."""
+    seconds = table["seconds"]
+    return table[(seconds >= seconds[0] + np.ptp(seconds) / 3) & (table["evaluations"] > 0)]
+
+
+def growth(times, values, blocks=12):
+    """How much numbers grow in some time, and how sure that is.
+
+    :return: Slope times duration, of a line through the medians of blocks, and its standard error
+    """
+    pieces = np.array_split(np.arange(len(times)), blocks)
+    x = np.array([times[each].mean() for each in pieces])
+    y = np.array([np.median(values[each]) for each in pieces])
+    x = (x - x.mean()) / np.ptp(times)
+    slope = (x @ y) / (x @ x)
+    rest = y - y.mean() - slope * x
+    return slope, np.sqrt(rest @ rest / (blocks - 2) / (x @ x))
+
+
+def verdicts(path):
+    """What grew and by how much, for each column of ``CONSTANT`` and the logs.
+
+    :return: Lines: column, smallest, largest, growth, its standard error, whether that is too much
+    """
+    table = warm(np.genfromtxt(path, delimiter=",", names=True))
+    for column, tolerance in CONSTANT.items():
+        grown, error = growth(table["seconds"], table[column])
+        bad = grown > tolerance and grown > 3 * error
+        yield column, table[column].min(), table[column].max(), grown, error, bool(bad)
+    logs = table["progress_kib"] + table["monitor_kib"]
+    rate = 1e6 * np.ptp(logs) / max(np.ptp(table["agent_steps"]), 1)
+    yield "log KiB/1M steps", logs.min(), logs.max(), rate, 0.0, bool(rate > LOGS)
+
+
+def report(name, path):
+    """Print the verdicts.
+
+    :return: Whether anything grew, or it was too short to know
+    """
     table = np.genfromtxt(path, delimiter=",", names=True)
-    late = table[len(table) // 2 :]
-    hours = late["seconds"] / 3600
-    memory = np.polyfit(hours, late["rss_mib"], 1)[0]
-    steps = np.ptp(late["agent_steps"])
-    logs = np.ptp(late["log_kib"]) / steps * 1e6 if steps else float("nan")
-    return {
-        "MiB/h": memory,
-        "rss MiB": (late["rss_mib"].min(), late["rss_mib"].max()),
-        "handles": (table["handles"].min(), late["handles"].min(), late["handles"].max()),
-        "log KiB per million agent steps": logs,
-        "other KiB": (late["other_kib"].min(), late["other_kib"].max()),
-        "agent steps": table["agent_steps"].max(),
-    }
+    if len(warm(np.atleast_1d(table))) < 12:
+        print(f"{name:<10} too short to know", flush=True)
+        return True
+    row = "{:<10} {:<18}{:>10.1f}{:>10.1f}{:>+10.2f} ± {:<8.2f}{}".format
+    found = list(verdicts(path))
+    for *numbers, bad in found:
+        print(row(name, *numbers, "GROWS" if bad else ""), flush=True)
+    return any(bad for *_, bad in found)
+
+
+def plot(path):
+    """Draw memory and open files over time, beside the csv file."""
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    for axes, column in zip(figure.subplots(2, 1, sharex=True), COLUMNS[1:3], strict=True):
+        axes.plot(table["seconds"] / 60, table[column])
+        axes.set_ylabel(column)
+        axes.set_ylim(bottom=0)
+    axes.set_xlabel("minutes")
+    figure.savefig(path.with_suffix(".png"))
+
+
+# ---------------------------------------------------------------------------- the short form
 
 
 def grows(folder, rollouts=200):
     """Many short rollouts with everything that ``train`` has; what grew in the last half of them.
 
-    :return: MiB of memory, handles, rows of progress.csv a rollout, largest sizes that must not
-        grow: of the estimator's memory in observations, of the episodes that the model keeps, and
-        of resume points in number
+    :return: MiB of memory, handles, threads, rows of progress.csv a rollout, largest sizes that
+        must not grow: of the estimator's memory in observations, of the episodes that the model
+        keeps, and of resume points in number
     """
     seen, real = [], KeepPoints._on_rollout_start
 
@@ -124,13 +256,9 @@ def grows(folder, rollouts=200):
     finally:
         KeepPoints._on_rollout_start = real
     table = np.array(seen)
-    growth = table[-1] - table[len(table) // 2]
-    return (
-        growth[0],
-        growth[1],
-        growth[2] / (len(table) - len(table) // 2),
-        table[:, 3:].max(axis=0),
-    )
+    grown = table[-1] - table[len(table) // 2]
+    rows = grown[3] / (len(table) - len(table) // 2)
+    return *grown[:3], rows, table[:, 4:].max(axis=0)
 
 
 def torture(folder, rollouts=200):
@@ -138,10 +266,11 @@ def torture(folder, rollouts=200):
 
     :param folder: An empty folder
     """
-    memory, handles, rows, (capacity, kept, points) = grows(folder, rollouts)
+    memory, handles, threads, rows, (capacity, kept, points) = grows(folder, rollouts)
     found = {
         f"memory grew by {memory:.1f} MiB": memory > 4,
         f"handles grew by {handles}": handles > 0,
+        f"threads grew by {threads}": threads > 0,
         f"{rows:.1f} rows of progress.csv for each rollout": rows > 2,
         f"an estimator remembers {capacity} observations": capacity > 64,
         f"the model keeps {kept} episodes": kept > 100,
@@ -151,28 +280,22 @@ def torture(folder, rollouts=200):
     yield Outcome(f"soak: {rollouts} rollouts", len(found), wrong=len(notes), notes=notes)
 
 
-def plot(path):
-    """Draw memory and open files over time, beside the csv file."""
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    for axes, column in zip(figure.subplots(2, 1, sharex=True), COLUMNS[1:3], strict=True):
-        axes.plot(table["seconds"] / 60, table[column])
-        axes.set_ylabel(column)
-        axes.set_ylim(bottom=0)
-    axes.set_xlabel("minutes")
-    figure.savefig(path.with_suffix(".png"))
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env", default="MultiRover-6-3-v0")
-    parser.add_argument("--minutes", type=float, default=120)
+    parser.add_argument("--minutes", type=float, default=120, help="of all trainings together")
+    parser.add_argument("--only", choices=TRAININGS, help="one training instead of all in turns")
     parser.add_argument("-o", "--out", type=Path, default=Path("soak"))
     args = parser.parse_args()
-    path = soak(args.env, args.minutes, args.out)
-    plot(path)
-    for name, value in slopes(path).items():
-        print(f"{name:<34} {np.round(value, 3).tolist()}")
+    names = [args.only] if args.only else list(TRAININGS)
+    row = "{:<10} {:<18}{:>10}{:>10}{:>10}".format
+    print(row("training", "column", "smallest", "largest", "growth"), flush=True)
+    grown = []
+    for name in names:
+        minutes = args.minutes / len(names)
+        path = soak(name, minutes, args.out, every=min(5.0, minutes))
+        plot(path)
+        grown.append(report(name, path))
+    sys.exit(int(any(grown)))
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ def commands(logs, out):
     one = ["--algo", "e2c_t", "--env", PREY, "-f", logs]
     few = ["--n-episodes", "2", "--n-envs", "2", "--verbose", "0", "--device", "cpu"]
     run = logs / "e2c_t" / f"{PREY}_1"
+    short = ["-n", str(rollout(PREY)), "--eval-freq", "-1", "--n-eval-envs", "1", "--verbose", "0"]
     zips = [run / f"{PREY}.adversary.zip", run / f"{PREY}.zip"]
     return {
         "enjoy": (enjoy.main, [*one, *few]),
@@ -54,11 +55,11 @@ def commands(logs, out):
         "train --opponent FILE": (
             train.main,
             [
-                *("--env", PREY, "-f", out / "logs", "--opponent", zips[0], "--eval-freq", "-1"),
-                *("-n", str(rollout(PREY)), "--n-eval-envs", "1", "--verbose", "0"),
+                *("--env", PREY, "-f", out / "logs", "--opponent", zips[0], *short),
                 *("-params", "n_envs:2", "n_steps:20", "n_epochs:1", "policy_kwargs.net_arch:[8]"),
             ],
         ),
+        "train -i FILE": (train.main, ["--env", PREY, "-f", out / "logs", "-i", zips[1], *short]),
     }
 
 
@@ -131,8 +132,7 @@ def poisons(run, payload):
     for name in ("config.yml", "args.yml"):
         text = code.format(payload.trace)
         yield f"{name}: objects", lambda r, n=name, t=text: _append(r / PREY / n, f"\nn_envs: {t}")
-    module = payload.trace.parent / "payload.py"
-    yield "config.yml: callback", lambda r: _callback(r, module, payload.trace)
+    yield "config.yml: callback", lambda r: _callback(r, payload.trace)
 
 
 def _objects(path, payload):
@@ -153,10 +153,10 @@ def _append(path, text):
     path.write_text("\n".join(lines) + text + "\n")
 
 
-def _callback(run, module, trace):
-    """A callback is code by name: only training may import it."""
-    module.write_text(f"import pathlib\npathlib.Path({str(trace)!r}).touch()\nCallback = dict\n")
-    _change(run / PREY / "config.yml", callback="payload.Callback")
+def _callback(run, trace):
+    """RL-Zoo imports a callback by its name, and calls it."""
+    command = {"subprocess.run": {"args": ["touch", str(trace)]}}
+    _change(run / PREY / "config.yml", callback=command)
 
 
 def _change(path, **values):
@@ -330,21 +330,28 @@ def control(logs, work):
         th.load(data, weights_only=False) if how != "plain" else pickle.load(data)
         assert trace.exists(), how
         trace.unlink()
-    copy = work / "copy"
-    shutil.rmtree(copy, ignore_errors=True)
-    shutil.copytree(logs, copy)
-    rewrite(copy / "e2c_t" / f"{PREY}_1" / f"{PREY}.zip", "data", in_data(Payload(trace)))
-    main, argv = commands(copy, work)["enjoy"]
-    wait(fork(quietly, main, [*argv, "--trust"]))
-    assert trace.exists(), "--trust does not unpickle"
-    trace.unlink()
+    trials = {
+        "enjoy": lambda run: rewrite(run / f"{PREY}.zip", "data", in_data(Payload(trace))),
+        "train -i FILE": lambda run: _callback(run, trace),
+    }
+    for command, spoil in trials.items():
+        copy = work / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(logs, copy)
+        spoil(copy / "e2c_t" / f"{PREY}_1")
+        main, argv = commands(copy, work)[command]
+        wait(fork(quietly, main, [*argv, "--trust"]))
+        assert trace.exists(), f"{command} --trust executes nothing"
+        trace.unlink()
 
 
 # Which commands look at which file; the others would only try the same again.
 _READ_BY = {
     "best_model": ["enjoy --load-best"],
     "rl_model": ["enjoy --load-last-checkpoint", "record"],
-    f"{PREY}.adversary": ["enjoy", "enjoy --opponent FILE", "train --opponent FILE", "push"],
+    f"{PREY}.adversary": [
+        *("enjoy", "enjoy --opponent FILE", "train --opponent FILE", "train -i FILE", "push"),
+    ],
     "evaluations": ["plot", "enjoy"],
 }
 
@@ -354,7 +361,7 @@ def readers(place):
     for start, names in _READ_BY.items():
         if place.startswith(start):
             return names
-    return ["enjoy", "export"]
+    return ["enjoy", "export", "train -i FILE"]
 
 
 def _everywhere(spoils):
@@ -384,7 +391,7 @@ def torture(work, every=True):
     tried = {(place, spoil): readers(place) for place, spoil in spoils.items()}
     tried["everywhere", _everywhere(spoils)] = list(commands(logs, work))
     yield _outcome("payloads in pickled places", logs, tried, trace, work, "works", "refused")
-    tried = {each: ["enjoy", "export"] for each in lies().items()}
+    tried = {each: ["enjoy", "export", "train -i FILE"] for each in lies().items()}
     yield _outcome("zip slips, bombs of zip and YAML", logs, tried, trace, work, "refused")
 
 
