@@ -71,11 +71,16 @@ def held(thing, seen=None):
 
 
 def inside(callbacks, model):
-    """The columns of ``INSIDE``; results of evaluations are kept, as Stable-Baselines3 does."""
+    """The columns of ``INSIDE``.
+
+    Results of evaluations are kept, as Stable-Baselines3 does. Neither they are counted nor the two
+    resume points (``points``), which hold them again.
+    """
     found = {type(each): each for each in callbacks}
     oem, evaluations = found[OEMRewardCallback], found[TeamEvalCallback]
     others = [vars(each) for each in callbacks if each is not evaluations]
-    own = [{k: v for k, v in each.items() if k not in ("locals", "globals")} for each in others]
+    left_out = ("locals", "globals", "points")
+    own = [{k: v for k, v in each.items() if k not in left_out} for each in others]
     counts = len(model.ep_info_buffer), len(evaluations.evaluations_timesteps)
     return held(oem.estimator) / 1024, held(own) / 1024, *counts
 
