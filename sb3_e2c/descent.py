@@ -7,8 +7,9 @@ wait for each other in every operation of some 50 µs, ours once in a minibatch.
 
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch as th
@@ -42,7 +43,9 @@ class Descent:
     """
 
     def __init__(self, policy: TeamPolicy, n_threads: int):
-        groups = [[p for p in group if p.requires_grad] for group in policy.clipped_together]
+        for parameter in policy.parameters():  # one that was frozen keeps no old gradient
+            parameter.grad = None
+        groups = [[p for p in group if p.requires_grad] for group in policy.clipped_together()]
         self._parameters = [parameter for group in groups for parameter in group]
         self._sizes = [sum(parameter.numel() for parameter in group) for group in groups]
         kind = MlpPasses if MlpPasses.is_for(policy, self._parameters) else Passes
@@ -52,21 +55,14 @@ class Descent:
         self._pool: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> "Descent":
-        self._torch_threads = th.get_num_threads()
-        if self._is_halved:
-            th.set_num_threads(
-                1
-            )  # for both threads: a thread takes it over with its first operation
-            if n_cores() > 1:
-                self._pool = ThreadPoolExecutor(1, thread_name_prefix="sb3_e2c-update")
+        if self._is_halved and n_cores() > 1:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="sb3_e2c-update")
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown()  # after an error, waits for the half that is being computed
             self._pool = None
-        if self._is_halved:
-            th.set_num_threads(self._torch_threads)
 
     def gradient(self, batch: TeamSamples, sequences: Sequences | None, weights: Weights) -> Terms:
         """Leave the gradient of the objective over a minibatch in the parameters.
@@ -84,7 +80,8 @@ class Descent:
             (passes, *part, weights, len(part[0].observations) / total)
             for passes, part in zip(self._passes, parts, strict=False)
         ]
-        terms = self._compute(tasks)
+        with _one_torch_thread() if len(tasks) > 1 else nullcontext():
+            terms = self._compute(tasks)
         whole = self._passes[0]
         for other in self._passes[1 : len(parts)]:
             whole.gradient.add_(other.gradient)
@@ -114,6 +111,17 @@ class Descent:
                 if norm + 1e-6 > max_norm:  # as torch's clip_grad_norm_
                     piece.mul_(max_norm / (norm + 1e-6))
         return norms
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Here, and in threads that compute for the first time meanwhile."""
+    before = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
 
 
 def _is_finite(number: float) -> bool:
@@ -149,13 +157,14 @@ def _can_be_halved(policy: TeamPolicy, parameters: Sequence[nn.Parameter]) -> bo
 def update_threads(wanted: int | None) -> int:
     """How many threads an update shall use.
 
-    :param wanted: 1 or 2; None: 2 if torch, too, may use several (``torch.set_num_threads``), this
-        process may use several cores, and it is nobody's worker
+    :param wanted: 1 or 2; None: 2 if torch would use two (``torch.set_num_threads``; where it may
+        use more, they do more than two halves), this process may use several cores, and it is
+        nobody's worker
     """
     if wanted is not None:
         return wanted
     is_alone = multiprocessing.parent_process() is None
-    return 2 if is_alone and min(th.get_num_threads(), n_cores()) > 1 else 1
+    return 2 if is_alone and th.get_num_threads() == 2 and n_cores() > 1 else 1
 
 
 def n_cores() -> int:

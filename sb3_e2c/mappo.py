@@ -45,13 +45,13 @@ from sb3_e2c.descent import Descent, update_threads
 from sb3_e2c.losses import normalize
 from sb3_e2c.monitor import named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
-from sb3_e2c.objective import Terms, Weights
+from sb3_e2c.objective import Weights
 from sb3_e2c.opponents import adversary_path, load_learner
 from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
-from sb3_e2c.sequences import Memory, Sequences
+from sb3_e2c.sequences import Memory
 from sb3_e2c.teams import check_batch, check_subclass, check_team, making, monitored, team_of
 from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
@@ -93,7 +93,7 @@ class MAPPO(PPO):
     :param opponent_kwargs: Arguments in which the opponents' model differs from the team's, in an
         :class:`sb3_e2c.OpponentVecEnv` whose opponents learn; it never has limits or a bonus
     :param update_threads: Threads that share the work of an update, 1 or 2, which changes the
-        rounding. None: 2 if torch may use several (``torch.set_num_threads``), the process may use
+        rounding. None: 2 if torch would use two (``torch.set_num_threads``), the process may use
         several cores, and it is nobody's worker
     :raises ValueError: for numbers that make no sense, or a batch smaller than a team
     :raises TypeError: for arguments of another kind
@@ -119,7 +119,6 @@ class MAPPO(PPO):
     clip_range_vf: FloatSchedule | None
     # Asked after every epoch whether the update ends there; TrustRegionMonitor sets it.
     stop_epochs: Callable[[], bool] | None = None
-    _descent: Descent | None = None  # of the update that is going on
     _log_interval = 1
 
     def __init__(
@@ -512,18 +511,17 @@ class MAPPO(PPO):
         samples = self.rollout_buffer.samples(
             self.policy, self.multipliers.values, self.normalize_values
         )
-        with Descent(self.policy, update_threads(self.update_threads)) as self._descent:
-            logs = self._train_epochs(samples)
-        self._descent = None
+        with Descent(self.policy, update_threads(self.update_threads)) as descent:
+            logs = self._train_epochs(samples, descent)
         self._check_learned()
         self._log_training(logs)
 
-    def _train_epochs(self, samples: TeamSamples) -> dict[str, list[float]]:
+    def _train_epochs(self, samples: TeamSamples, descent: Descent) -> dict[str, list[float]]:
         """All passes over the rollout; returns the numbers to log, by name."""
         logs: dict[str, list[float]] = defaultdict(list)
         for epoch in range(self.n_epochs):
             logs["approx_kl"].clear()  # as in PPO, only the last epoch's
-            within_kl = self._train_epoch(samples, logs)
+            within_kl = self._train_epoch(samples, descent, logs)
             self._n_updates += 1
             if not within_kl:
                 if self.verbose >= 1:
@@ -538,7 +536,9 @@ class MAPPO(PPO):
         if env is not None and env.learner is not None:
             env.learner.train(self._current_progress_remaining)
 
-    def _train_epoch(self, samples: TeamSamples, logs: dict[str, list[float]]) -> bool:
+    def _train_epoch(
+        self, samples: TeamSamples, descent: Descent, logs: dict[str, list[float]]
+    ) -> bool:
         """One pass over the rollout (Alg. 2 l. 13-16).
 
         :return: False if the policy has moved further than ``target_kl`` allows
@@ -546,13 +546,16 @@ class MAPPO(PPO):
         weights = self._weights()
         batches = self.rollout_buffer.minibatches(samples, self.batch_size // self.n_agents)
         for batch, sequences in batches:
-            terms = self._gradient(batch, sequences, weights)
+            if self.normalize_advantage:
+                batch = batch._replace(advantages=normalize(batch.advantages))
+            with self._explained_divergence():
+                terms = descent.gradient(batch, sequences, weights)
             loss = terms.loss(weights)
             for name, number in (*terms._asdict().items(), ("loss", loss)):
                 logs[name].append(number)
             if self.target_kl is not None and terms.approx_kl > 1.5 * self.target_kl:
                 return False
-            self._gradient_step(loss)
+            self._gradient_step(descent, loss)
         return True
 
     def _weights(self) -> Weights:
@@ -564,20 +567,11 @@ class MAPPO(PPO):
             vf_coef=self.vf_coef,
         )
 
-    def _gradient(self, batch: TeamSamples, sequences: Sequences | None, weights: Weights) -> Terms:
-        """Leave the gradient of the objective over a minibatch in the parameters."""
-        assert self._descent is not None, "train() makes it"
-        if self.normalize_advantage:
-            batch = batch._replace(advantages=normalize(batch.advantages))
-        with self._explained_divergence():
-            return self._descent.gradient(batch, sequences, weights)
-
-    def _gradient_step(self, loss: float) -> None:
+    def _gradient_step(self, descent: Descent, loss: float) -> None:
         """Follow the gradient that the parameters have."""
-        assert self._descent is not None, "train() makes it"
         if not math.isfinite(loss):
             raise self._divergence(f"the loss is {loss}")
-        for norm in self._descent.clip(self.max_grad_norm):
+        for norm in descent.clip(self.max_grad_norm):
             if not math.isfinite(norm):
                 raise self._divergence(f"the size of the gradients is {norm}")
         self.policy.optimizer.step()
@@ -702,7 +696,7 @@ class MAPPO(PPO):
         return ["policy", "policy.optimizer", "multipliers"], []
 
     def _excluded_save_params(self) -> list[str]:
-        own = ("_recorder", "_memory", "_descent", "stop_epochs", "opponent", "_adversary_file")
+        own = ("_recorder", "_memory", "stop_epochs", "opponent", "_adversary_file")
         return [*super()._excluded_save_params(), *own]
 
     def save(

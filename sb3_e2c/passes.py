@@ -70,7 +70,9 @@ class Passes:
         found = th.autograd.grad(outputs, self.parameters, known, allow_unused=True)
         self.pieces = []
         for piece, gradient in zip(self._all_pieces, found, strict=True):
-            if gradient is not None:  # else it stays zero
+            if gradient is None:
+                piece.zero_()
+            else:
                 piece.copy_(gradient)
             self.pieces.append(None if gradient is None else piece)
         del self._outputs
@@ -79,8 +81,6 @@ class Passes:
 class MlpPasses(Passes):
     """Passes of a :class:`TeamPolicy` as it is, for Gaussian or categorical actions, on a CPU.
 
-    Forward hooks of its layers are not called.
-
     :param policy: See :meth:`is_for`
     :param parameters: All that the policy has
     """
@@ -88,9 +88,8 @@ class MlpPasses(Passes):
     def __init__(self, policy: TeamPolicy, parameters: Sequence[nn.Parameter]):
         super().__init__(policy, parameters)
         pieces: Any = dict(zip(parameters, self._all_pieces, strict=True))
-        self._actor, self._value, self._cost = (
-            _Network(layers, pieces) for layers in _networks(policy)
-        )
+        networks = [_Network([*hidden, last], pieces) for hidden, last in _networks(policy)]
+        self._actor, self._value, *self._cost = networks
         self._ratings: GaussianRating | CategoricalRating = CategoricalRating()
         if isinstance(policy.action_dist, DiagGaussianDistribution):
             self._ratings = GaussianRating(policy.log_std, pieces[policy.log_std])
@@ -98,14 +97,15 @@ class MlpPasses(Passes):
     @staticmethod
     def is_for(policy: TeamPolicy, parameters: Sequence[nn.Parameter]) -> bool:
         """Whether the policy is one that can be computed so."""
-        known = (nn.Linear, nn.Tanh, nn.ReLU)
-        modules = [layer for layers in _networks(policy) for layer in layers]
         return (
             type(policy) is TeamPolicy
+            and not any(hasattr(TeamPolicy, name) for name in vars(policy))  # a method replaced
             and type(policy.action_dist) in STATELESS
             and type(policy.pi_features_extractor) is FlattenExtractor
             and type(policy.vf_features_extractor) is FlattenExtractor
-            and all(type(module) in known and not _is_watched(module) for module in modules)
+            and all(_is_mlp(*parts) for parts in _networks(policy))
+            and not any(_is_watched(module) for module in policy.modules())
+            and not any(parameter._backward_hooks for parameter in parameters)
             and len(parameters) == len(list(policy.parameters()))
             and all(p.device.type == "cpu" and p.dtype == th.float32 for p in parameters)
         )
@@ -118,9 +118,9 @@ class MlpPasses(Passes):
             joint = policy._joint_features(features, batch.critic_states)
             values = self._value.forward(joint)
             cost_values = batch.cost_returns
-            if policy.n_constraints:
+            for network in self._cost:
                 seen = joint if policy.n_parties == 1 else features
-                cost_values = self._cost.forward(seen).view(batch.cost_returns.shape)
+                cost_values = network.forward(seen).view(batch.cost_returns.shape)
             actions = policy._flatten_actions(batch.actions)
             rating = self._ratings.rate(self._actor.forward(own), actions)
         log_prob, entropy = (each.view(shape) for each in rating)
@@ -131,23 +131,42 @@ class MlpPasses(Passes):
         known = Rating(gradients.log_prob.view(-1), gradients.entropy.view(-1))
         self._actor.backward(self._ratings.gradient(known))
         self._value.backward(gradients.values)
-        if self.policy.n_constraints:
-            self._cost.backward(gradients.cost_values.flatten(0, 1))
+        for network in self._cost:
+            network.backward(gradients.cost_values.flatten(0, 1))
 
 
-def _networks(policy: TeamPolicy) -> list[list[nn.Module]]:
-    """Layers of the actor, the reward critic and the cost critics."""
+def _networks(policy: TeamPolicy) -> list[tuple[Any, nn.Module]]:
+    """Hidden layers and the last one of the actor, the reward critic and the cost critics."""
     extractor = policy.mlp_extractor
-    actor = [*extractor.policy_net, policy.action_net]
-    value = [*extractor.value_net, policy.value_net]
-    if not policy.n_constraints:
-        return [actor, value, []]
-    return [actor, value, [*policy.cost_extractor, policy.cost_net]]  # type: ignore[misc]
+    networks: list[tuple[Any, nn.Module]] = [
+        (extractor.policy_net, policy.action_net),
+        (extractor.value_net, policy.value_net),
+    ]
+    return networks + [(policy.cost_extractor, policy.cost_net)] * bool(policy.n_constraints)
+
+
+def _is_mlp(hidden: Any, last: nn.Module) -> bool:
+    """Whether it is linear layers with one kind of activation behind each but the last."""
+    if type(hidden) is not nn.Sequential:
+        return False
+    kinds = [type(layer) for layer in hidden]
+    linear, activations = [*kinds[::2], type(last)], kinds[1::2]
+    return (
+        len(kinds) % 2 == 0
+        and set(linear) == {nn.Linear}
+        and set(activations) in ({nn.Tanh}, {nn.ReLU}, set())
+        and all(each.bias is not None for each in [*list(hidden)[::2], last])
+    )
 
 
 def _is_watched(module: nn.Module) -> bool:
-    """Whether hooks of a module may change what it computes."""
-    return bool(module._forward_pre_hooks or module._backward_hooks)
+    """Whether hooks of a module may change, or see, what it computes."""
+    return bool(
+        module._forward_pre_hooks
+        or module._forward_hooks
+        or module._backward_pre_hooks
+        or module._backward_hooks
+    )
 
 
 class _Network:

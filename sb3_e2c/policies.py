@@ -203,7 +203,6 @@ class TeamPolicy(ActorCriticPolicy):
         if self.optimizer_class is th.optim.Adam and "foreach" not in kwargs:
             kwargs.setdefault("fused", True)  # one call for all parameters; a fifth of an update
         self.optimizer = self.optimizer_class(self._parameter_groups(lr_schedule), **kwargs)
-        self.clipped_together = self._clipped_together()
 
     def _build_cost_critic(self) -> None:
         if not self.n_constraints:
@@ -231,7 +230,7 @@ class TeamPolicy(ActorCriticPolicy):
             {"params": critic_params, "lr": self.critic_lr_schedule(1)},
         ]
 
-    def _clipped_together(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    def clipped_together(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         """Parameters whose gradients are clipped together: all but the cost critics', and those."""
         cost = [p for module in self._cost_modules() for p in module.parameters()]
         cost_ids = {id(p) for p in cost}

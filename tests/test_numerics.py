@@ -219,11 +219,11 @@ def test_gradients_that_are_not_finite_stop_the_run_before_the_step():
     model = make(**LIMITS)
     model._setup_learn(32)
     before = flat(model)
-    with Descent(model.policy, 1) as model._descent:
-        model._descent._passes[0].gradient[3] = math.nan
+    with Descent(model.policy, 1) as descent:
+        descent._passes[0].gradient[3] = math.nan
         message = r"size of the gradients is nan after .* Lower learning"
         with pytest.raises(ValueError, match=message):
-            model._gradient_step(1.0)
+            model._gradient_step(descent, 1.0)
     assert flat(model).equal(before)
 
 

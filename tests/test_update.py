@@ -325,6 +325,122 @@ def test_a_layer_that_is_frozen_does_not_learn():
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "GruPolicy"])
+def test_a_layer_that_is_frozen_later_stays_where_it_is(policy):
+    model = make(policy).learn(96)
+    frozen = model.policy.action_net.weight.requires_grad_(False)
+    before = frozen.clone()
+    model.learn(96)  # the optimizer would go on with the last gradient
+    assert frozen.equal(before)
+
+
+class Gated(TeamPolicy):
+    """Adds a layer after the optimizer was made, as is usual with Stable-Baselines3."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.gate = nn.Linear(self.action_net.out_features, self.action_net.out_features)
+        self.optimizer = th.optim.Adam(self.parameters(), lr=1e-3)
+
+    def _rate(self, latent, actions):
+        self.gated = True
+        return super()._rate(latent, actions)
+
+    def evaluate_steps(self, observations, *args):
+        found = super().evaluate_steps(observations, *args)
+        return found._replace(entropy=found.entropy + self.gate.bias.sum())
+
+
+def test_a_layer_that_was_added_later_learns():
+    model = make(Gated, ent_coef=0.1)
+    before = model.policy.gate.bias.clone()
+    model.learn(96)
+    assert not model.policy.gate.bias.equal(before)
+
+
+class Odd(nn.Module):
+    """Hidden layers that are no sequence."""
+
+    def __init__(self, inner):
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, inputs):
+        return self.inner(inputs)
+
+
+def _other_activation(policy):
+    policy.mlp_extractor.policy_net[-1] = nn.ReLU()
+
+
+def _without_activation(policy):
+    policy.mlp_extractor.policy_net[-1] = nn.Identity()
+
+
+def _other_container(policy):
+    policy.mlp_extractor.policy_net = Odd(policy.mlp_extractor.policy_net)
+
+
+def _hook(policy):
+    policy.action_net.register_forward_hook(lambda module, inputs, output: 2.0 * output)
+
+
+def _backward_hook(policy):
+    policy.value_net.register_full_backward_pre_hook(lambda module, gradient: gradient)
+
+
+def _weight_hook(policy):
+    policy.action_net.weight.register_hook(lambda gradient: 0.0 * gradient)
+
+
+def _other_method(policy):
+    policy._rate = lambda *args: TeamPolicy._rate(policy, *args)
+
+
+def _no_bias(policy):
+    policy.value_net.bias = None
+
+
+CHANGES = [_other_activation, _without_activation, _other_container, _hook, _backward_hook]
+CHANGES += [_weight_hook, _other_method, _no_bias]
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+def test_changed_networks_are_left_to_torch(change):
+    model, batch, sequences = collected("MlpPolicy")
+    assert MlpPasses.is_for(model.policy, [*model.policy.parameters()])
+    change(model.policy)
+    assert not MlpPasses.is_for(model.policy, [*model.policy.parameters()])
+    _, expected, _ = by_the_formulas(model, batch, sequences, WEIGHTS)
+    with Descent(model.policy, 1) as slope:
+        slope.gradient(batch, sequences, WEIGHTS)
+    for parameter in model.policy.parameters():
+        if change is _weight_hook and parameter is model.policy.action_net.weight:
+            assert not parameter.grad.any()
+        else:
+            assert_close(parameter.grad, expected[parameter])
+
+
+def test_a_gradient_that_is_missing_once_is_none_then():
+    model, batch, sequences = collected("MlpPolicy")
+    passes = Passes(model.policy, [*model.policy.parameters()])
+    outputs = passes.forward(batch, sequences)
+    passes.backward(Outputs(*(th.ones_like(each) for each in outputs)))
+    assert passes.gradient.all()
+    outputs = passes.forward(batch, sequences)
+    passes._outputs = passes._outputs._replace(values=th.zeros_like(outputs.values))
+    passes.backward(Outputs(*(th.ones_like(each) for each in outputs)))
+    sizes = dict(
+        zip(
+            passes.parameters,
+            passes.gradient.split([p.numel() for p in passes.parameters]),
+            strict=True,
+        )
+    )
+    assert not sizes[model.policy.value_net.weight].any()
+    assert sizes[model.policy.action_net.weight].any()
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "GruPolicy"])
 @pytest.mark.parametrize("size", [0.01, 100.0])
 def test_gradients_are_clipped_as_by_torch_the_cost_critics_on_their_own(policy, size):
     model, batch, sequences = collected(policy)
@@ -332,8 +448,8 @@ def test_gradients_are_clipped_as_by_torch_the_cost_critics_on_their_own(policy,
     with Descent(model.policy, 1) as slope:
         slope.gradient(batch, sequences, WEIGHTS)
         norms = slope.clip(size)
-    ours = [[p.grad for p in group] for group in model.policy.clipped_together]
-    for group, got, norm in zip(model.policy.clipped_together, ours, norms, strict=True):
+    ours = [[p.grad for p in group] for group in model.policy.clipped_together()]
+    for group, got, norm in zip(model.policy.clipped_together(), ours, norms, strict=True):
         for parameter in group:
             parameter.grad = expected[parameter]
         assert norm == pytest.approx(nn.utils.clip_grad_norm_(group, size).item(), rel=1e-5)
@@ -417,9 +533,20 @@ def test_two_threads_give_the_same_bits_again_and_where_there_is_one_core(
     assert_close(flat(single), flat(together), 1e-4)
 
 
+@pytest.fixture
+def torch_threads():
+    """Torch may use three."""
+    before = th.get_num_threads()
+    th.set_num_threads(3)
+    yield 3
+    th.set_num_threads(before)
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("where", ["here", "beside"])
-def test_an_error_on_either_thread_ends_the_update_and_the_thread(where, error, monkeypatch):
+def test_an_error_on_either_thread_ends_the_update_and_the_thread(
+    where, error, monkeypatch, torch_threads
+):
     monkeypatch.setattr(descent, "HALVED_FROM", 1)
     monkeypatch.setattr(descent, "n_cores", lambda: 2)
     model = make(update_threads=2)
@@ -434,10 +561,9 @@ def test_an_error_on_either_thread_ends_the_update_and_the_thread(where, error, 
         patch.setattr(descent, "_part", fail)
         with pytest.raises(error):
             model.learn(96)
+        assert th.get_num_threads() == torch_threads
     assert threading.active_count() == before
-    assert th.get_num_threads() == 1
     model.learn(96)
-    assert model._descent is None
 
 
 def test_updates_leave_no_threads_and_the_number_of_torch_s_threads(monkeypatch):
@@ -447,7 +573,7 @@ def test_updates_leave_no_threads_and_the_number_of_torch_s_threads(monkeypatch)
     monkeypatch.setattr(th, "set_num_threads", chosen.append)
     model = learned("MlpPolicy", 2, monkeypatch)
     assert threading.active_count() == before
-    assert chosen == [1, 3] * 3
+    assert chosen == [1, 3] * (len(chosen) // 2) != []
     assert model._n_updates == 3 * 2
 
 
@@ -455,7 +581,7 @@ def test_updates_leave_no_threads_and_the_number_of_torch_s_threads(monkeypatch)
     ("wanted", "of_torch", "cores", "is_worker", "expected"),
     [
         (None, 2, 2, False, 2),
-        (None, 8, 8, False, 2),
+        (None, 8, 8, False, 1),  # torch's own do more than two halves
         (None, 1, 2, False, 1),  # several runs at once
         (None, 2, 1, False, 1),
         (None, 2, 2, True, 1),
