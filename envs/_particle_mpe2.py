@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sb3_e2c.envs._particle_config import ParticleConfig, ParticleTask
 
+_SCALE = 350  # pixels of mpe2's picture for a radius of 1, however far it zooms
+
 
 class _Replay:
     """Stands in for the random generator of one mpe2 reset and gives a known start."""
@@ -61,15 +63,43 @@ def restart(world: Any, goal: int, positions: np.ndarray) -> None:
 
 
 def picture(world: Any, task: ParticleTask) -> np.ndarray:
-    """RGB image of a world as mpe2 draws it, with who is who, uint8, shape (height, width, 3)."""
+    """RGB image of a world as mpe2 draws it, with who is who, uint8, shape (height, width, 3).
+
+    Landmarks that agents pass through are hollow: mpe2 gives some of them the color of agents.
+    """
     image = Image.fromarray(np.ascontiguousarray(world.render()))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(size=18)
-    colors = {entity.name: entity.color for entity in world.world.entities}
-    for line, (label, name) in enumerate(
-        (("team", task.team[0]), ("adversary", task.opponents[0]))
-    ):
-        y = 12 + 24 * line
+    hollow = [each for each in world.world.landmarks if not each.collide]
+    for entity in hollow:
+        x, y = _pixel(world, entity)
+        _disk(draw, x, y, 0.5 * entity.size * _SCALE, "white")
+    for line, (label, entity) in enumerate(_legend(world.world, task).items()):
+        y = 20 + 24 * line
         # mpe2 draws bodies in 200 times their color
-        draw.ellipse((12, y, 28, y + 16), fill=tuple(int(200 * c) for c in colors[name]))
-        draw.text((36, y - 3), label, fill="black", font=font)
+        _disk(draw, 20, y, 8, tuple(int(200 * c) for c in entity.color))
+        if entity in hollow:
+            _disk(draw, 20, y, 4, "white")
+        draw.text((36, y - 11), label, fill="black", font=font)
     return np.array(image)
+
+
+def _legend(world: Any, task: ParticleTask) -> dict[str, Any]:
+    """One entity of each kind, by what it is."""
+    agents = {agent.name: agent for agent in world.agents}
+    kinds = {"team": agents[task.team[0]], "adversary": agents[task.opponents[0]]}
+    if not task.has_goal:
+        return kinds | {"obstacle": world.landmarks[0]}
+    goal = world.agents[0].goal_a
+    other = next(each for each in world.landmarks if each is not goal)
+    return kinds | {"the landmark that counts": goal, "another landmark": other}
+
+
+def _pixel(world: Any, entity: Any) -> tuple[float, float]:
+    """Where mpe2 draws an entity; its picture zooms so that everything is in it."""
+    reach = max(np.abs(each.state.p_pos).max() for each in world.world.entities)
+    x, y = entity.state.p_pos / reach * 0.9
+    return world.width // 2 * (1 + x), world.height // 2 * (1 - y)
+
+
+def _disk(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, fill: Any) -> None:
+    draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=fill)

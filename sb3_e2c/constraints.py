@@ -21,6 +21,8 @@ def parse_cost_limits(cost_limits: float | Sequence[float] | np.ndarray | None) 
     :raises ValueError: if a limit is negative or not a number
     """
     try:
+        if isinstance(cost_limits, str | bytes):
+            raise TypeError
         limits = np.atleast_1d(np.asarray([] if cost_limits is None else cost_limits, np.float64))
     except (OverflowError, TypeError, ValueError):
         limits = np.array([np.nan])

@@ -14,7 +14,7 @@ def test_limits_are_given_as_nothing_a_number_or_several():
     assert constraints.parse_cost_limits([0, np.inf]).tolist() == [0.0, np.inf]
 
 
-@pytest.mark.parametrize("limits", [-1, [3, float("nan")], [[1.0]]])
+@pytest.mark.parametrize("limits", [-1, [3, float("nan")], [[1.0]], "20"])
 def test_a_limit_that_makes_no_sense_is_refused(limits):
     with pytest.raises(ValueError, match=r"cost_limits is .* expected None, a number or a list"):
         constraints.parse_cost_limits(limits)

@@ -523,6 +523,20 @@ def test_the_simulator_draws_what_mpe2_draws(module):
     np.testing.assert_array_equal(sim.render(1), frame)
 
 
+@pytest.mark.parametrize("goal", [0, 1])
+def test_landmarks_do_not_look_like_agents(goal):
+    env = keep_away_v0.parallel_env(render_mode="rgb_array")
+    env.reset(
+        seed=0, options={"goal": goal, "agents": FAR[:4], "landmarks": [(0.5, -1), (-1, 0.5)]}
+    )
+    frame = env.render()
+    reach = max(np.abs(FAR[:4]).max(), 1.0)
+    for x, y in np.array([(0.5, -1), (-1, 0.5)]) / reach * 0.9:
+        assert (frame[int(350 * (1 - y)), int(350 * (1 + x))] == 255).all()
+    for x, y in np.array(FAR[:4]) / reach * 0.9:
+        assert not (frame[int(350 * (1 - y)), int(350 * (1 + x))] == 255).all()
+
+
 # ---- errors
 
 

@@ -79,7 +79,14 @@ def play(place: Place, against: dict[str, str], n_episodes: int) -> Iterator[dic
     """
     job = place.job
     flags = ["--algo", job.method.algo, "--env", job.env, "-f", str(place.log_folder)]
-    flags += ["--n-episodes", str(n_episodes), "--n-envs", str(min(n_episodes, 64))]
+    flags += [
+        "--n-episodes",
+        str(n_episodes),
+        "--n-envs",
+        str(min(n_episodes, 64)),
+        "--verbose",
+        "0",
+    ]
     flags += ["--seed", str(_SEED + 100 * job.seed), "--opponent", *against.values()]
     result = enjoy.enjoy(enjoy.make_parser().parse_args(flags))
     for name, each in zip(against, result["against"], strict=True):

@@ -220,7 +220,7 @@ def _mean(mean: Any, error: Any) -> str:
 
 
 def enjoy(args: argparse.Namespace) -> dict[str, Any]:
-    """Evaluate, and film if asked.
+    """Evaluate, write and print what came of it, and film, as asked.
 
     :param args: See :func:`make_parser`
     :return: See :func:`summarize`; with opponents also ``opponent``, and what came of each one that
@@ -238,9 +238,14 @@ def enjoy(args: argparse.Namespace) -> dict[str, Any]:
             who = {"opponent": opponent} if has_opponents else {}
             settings = {"deterministic": args.deterministic, "seed": args.seed, **who}
             summaries.append(summarize(run, model, result, **settings))
-    if args.video is not None:
+    summary = {**summaries[0], "against": summaries} if has_opponents else summaries[0]
+    if args.json is not None:
+        write_whole(args.json, json.dumps(summary, indent=2) + "\n")
+    if args.verbose > 0:
+        print(report(summary), flush=True)
+    if args.video is not None:  # last: a film may take minutes
         _film(run, model, args)
-    return {**summaries[0], "against": summaries} if has_opponents else summaries[0]
+    return summary
 
 
 def _evaluate(model: MAPPO, env: VecEnv, args: argparse.Namespace) -> TeamEvaluation:
@@ -259,10 +264,12 @@ def _evaluate(model: MAPPO, env: VecEnv, args: argparse.Namespace) -> TeamEvalua
 def _film(run: Run, model: MAPPO, args: argparse.Namespace) -> None:
     kwargs = {**(args.env_kwargs or {}), "render_mode": "rgb_array"}
     if args.verbose > 0:
-        print(f"Filming one episode to {args.video}; long ones take minutes", flush=True)
+        print(
+            f"Filming one episode to {args.video}; 2000 steps take minutes (-P: count)", flush=True
+        )
     with closing(make_env(run, 1, args.seed, kwargs, args.trust)) as env:
         choose_opponent(run, model, env, args.opponent[0], args.deterministic_opponent)
-        record_episode(model, env, args.video, args.deterministic)
+        record_episode(model, env, args.video, args.deterministic, args.progress)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -272,11 +279,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     args = make_parser().parse_args(sys.argv[1:] if argv is None else argv)
     with one_line_errors():
-        summary = enjoy(args)
-        if args.json is not None:
-            write_whole(args.json, json.dumps(summary, indent=2) + "\n")
-        if args.verbose > 0:
-            print(report(summary))
+        enjoy(args)
 
 
 if __name__ == "__main__":

@@ -148,7 +148,7 @@ def evaluate(run: Run, args: Namespace) -> dict[str, Any]:
     :param run: The run
     :param args: See :func:`make_parser`
     """
-    flags = {**vars(enjoy.make_parser().parse_args([])), **vars(args)}
+    flags = {**vars(enjoy.make_parser().parse_args([])), **vars(args), "verbose": 0}
     results = enjoy.enjoy(Namespace(**flags))
     results.pop("against", None)  # its own adversary only: the same numbers again
     versions = {name: metadata.version(name) for name in _PACKAGES}

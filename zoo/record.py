@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import imageio
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
+from tqdm.auto import tqdm
 
 from sb3_e2c import MAPPO
 from sb3_e2c.saving import atomic_write
@@ -173,15 +174,20 @@ def add_title(frame: np.ndarray, title: str) -> np.ndarray:
     return np.concatenate([np.asarray(bar), frame])
 
 
-def record_episode(model: MAPPO, env: VecEnv, path: Path, deterministic: bool) -> None:
+def record_episode(
+    model: MAPPO, env: VecEnv, path: Path, deterministic: bool, progress: bool = False
+) -> None:
     """Film one episode of the first world.
 
     :param model: The team
     :param env: Worlds with ``render_mode="rgb_array"``
     :param path: A name that ends in .gif or .mp4
     :param deterministic: Whether it takes the most likely actions
+    :param progress: Whether to count the pictures
     """
-    write_video(film(model, env, 1, deterministic), path, _frames_per_second(env))
+    frames = film(model, env, 1, deterministic)
+    with closing(tqdm(frames, unit=" pictures", disable=not progress)) as counted:
+        write_video(counted, path, _frames_per_second(env))
 
 
 def _frames_per_second(env: VecEnv) -> float:
