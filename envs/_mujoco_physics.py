@@ -256,6 +256,8 @@ class BatchPhysics(Physics):
 
     def get_state(self) -> np.ndarray:
         """All that the next steps depend on, shape (W, L)."""
+        if self._batch is None and self._state is not None:
+            return self._state.copy()  # closed; starting again would be for nothing
         return np.array(self._started().state)
 
     def set_state(self, rows: np.ndarray) -> None:

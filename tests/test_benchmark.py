@@ -146,6 +146,11 @@ def test_the_paper_without_memory_is_the_paper_with_other_networks():
     assert mlp.methods["c_mappo-literal"].preset == "headline,lambda_1,literal_dual"
 
 
+def test_a_suite_may_have_the_name_of_the_one_that_it_builds_on(tmp_path):
+    (tmp_path / "smoke.yml").write_text("base: smoke\nseeds: 7\n")
+    assert len(read_suite(tmp_path / "smoke.yml").seeds) == 7
+
+
 def test_results_keep_a_suite_that_needs_no_other_file(tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text("base: smoke\nseeds: 7\n")

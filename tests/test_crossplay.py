@@ -1,5 +1,7 @@
 """Teams of a benchmark against each other's adversaries."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +13,7 @@ from sb3_e2c.zoo.report import readable_crossplay
 from sb3_e2c.zoo.suite import read_suite
 
 ENV = "KeepAway-v0"
+OTHERS = ("c_mappo/seed_0", "c_mappo/seed_1")
 TINY = f"""
 seeds: 2
 window: 2
@@ -63,6 +66,31 @@ def test_what_has_been_played_is_not_played_again(played, monkeypatch):
     (call,) = calls
     assert len(call[1]) == 1
     assert path.read_text().splitlines() == rows  # the same episodes again
+
+
+def test_more_episodes_or_a_new_training_are_played_anew(played, monkeypatch):
+    _, flags, path = played
+    calls = []
+    monkeypatch.setattr(
+        crossplay, "play", lambda *a, play=crossplay.play: calls.append(a) or play(*a)
+    )
+    crossplay.main([*flags[:-5], "--n-episodes", "2", "--pool-seeds", "0", "1"])
+    assert sum(len(call[1]) for call in calls) == 14
+    assert (pd.read_csv(path)["episodes"] == 2).all()
+    crossplay.main(flags)  # as it was
+    calls.clear()
+    done = path.parent / ENV / "mappo/seed_1/run.json"
+    text = done.read_text()
+    done.write_text(text.replace(json.loads(text)["finished"], "2100-01-01T00:00:00+00:00"))
+    crossplay.main(flags)
+    played_again = {(call[0].job.name, name) for call in calls for name in call[1]}
+    others = {(f"{ENV}/{run}", "mappo/seed_1") for run in ("mappo/seed_0", *OTHERS)}
+    assert played_again == others | {
+        (f"{ENV}/mappo/seed_1", n) for n in ("own", "random", "mappo/seed_0")
+    }
+    assert len(pd.read_csv(path)) == 14
+    done.write_text(text)
+    crossplay.main(flags)
 
 
 def test_the_report_shows_it(played):

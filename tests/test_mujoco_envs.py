@@ -810,6 +810,8 @@ def test_close_ends_the_threads_and_a_later_step_starts_them_again(scenario):
         assert n_threads_at_most(before + 2)  # those of the second
     sims[1].close()
     assert n_threads_at_most(before)
+    pickle.dumps(sims)  # needs no threads
+    assert n_threads_at_most(before)
 
 
 def test_a_time_limit_truncates():

@@ -218,9 +218,24 @@ def test_what_grows_is_reported(tmp_path, capsys):
 
 
 def test_arrays_that_an_object_holds_are_counted_once():
-    inner = {"a": np.zeros(10), "b": [np.zeros(5, np.int8), b"abc"]}
+    inner = {"a": np.zeros(1000), "b": [np.zeros(500, np.int8)]}
     inner["self"] = inner
-    assert soak.held([inner, inner["a"], int]) == 80 + 5 + len(b"abc")
+    once = soak.held([inner])
+    assert 8500 < once < 9500  # and a few hundred bytes for the containers
+    assert soak.held([inner, inner["a"], int]) == once + 16  # two more places in the list
+
+
+class _Slots:
+    __slots__ = ("rows",)
+
+
+def test_numbers_and_slots_are_counted_too():
+    slots = _Slots()
+    slots.rows = np.zeros(10_000)
+    floats = [float(i) for i in range(10_000)]
+    assert soak.held({"x": floats}) > 10_000 * (8 + 24)
+    assert soak.held([{"r": i} for i in range(1000)]) > 1000 * 64
+    assert soak.held(slots) > 80_000
 
 
 def test_a_long_training_does_not_grow(tmp_path):

@@ -25,7 +25,7 @@ from sb3_e2c import E2CMAPPO, GradientMultipliers, OEMRewardCallback
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.multipliers import Multipliers
 from sb3_e2c.zoo import cli, configuration, demo, enjoy, train
-from sb3_e2c.zoo.build import make_worlds
+from sb3_e2c.zoo.build import check_networks, make_worlds
 from sb3_e2c.zoo.configuration import FOLDER, merge, read_yaml, resolve
 from sb3_e2c.zoo.console import UserError, check_device, check_writable, parse_value, write_whole
 from sb3_e2c.zoo.curves import plot_learning
@@ -456,6 +456,46 @@ def test_continuing_refuses_what_would_be_another_experiment(copy, capsys):
     argv = ["--env", ENV, "-f", copy, "-i", start, "-params", "cost_limits:1.0"]
     assert "cannot become 1.0" in refusal(capsys, train.main, argv)
     assert not run_folder(copy, 2).exists()
+
+
+@pytest.mark.parametrize("how", ["nothing", "params", "file", "same class"])
+def test_continuing_does_not_run_what_the_file_names(copy, capsys, how):
+    marker = copy / "executed"
+    path = run_folder(copy) / ENV / "config.yml"
+    named = {"subprocess.run": {"args": ["touch", str(marker)]}}
+    if how == "same class":
+        named = {
+            "stable_baselines3.common.callbacks.CheckpointCallback": {"save_path": str(marker)}
+        }
+    path.write_text(yaml.safe_dump({**read_yaml(path), "callback": named}))
+    argv = ["--env", ENV, "-f", copy, "-i", run_folder(copy) / f"{ENV}.zip", "-n", ROLLOUT]
+    argv += ["--verbose", "0", "--eval-freq", "-1"]
+    if how == "nothing":
+        assert "which is code; say --trust" in refusal(capsys, train.main, argv)
+    elif how == "file":
+        (copy / "mine.yml").write_text(yaml.safe_dump({ENV: {"callback": {}}}))
+        argv += ["--conf-file", copy / "mine.yml"]
+        assert "callback {}" in refusal(capsys, train.main, argv)
+    elif how == "params":
+        assert "callback {}" in refusal(capsys, train.main, [*argv, "-params", "callback:{}"])
+    else:
+        word = "callback:{'stable_baselines3.common.callbacks.CheckpointCallback':{'save_freq':1}}"
+        assert "save_path" in refusal(capsys, train.main, [*argv, "-params", word])
+    assert not marker.exists()
+
+
+def test_a_run_that_goes_on_may_use_other_threads(copy):
+    argv = ["--env", ENV, "-f", str(copy), "-i", str(run_folder(copy) / f"{ENV}.zip")]
+    argv += ["-n", str(ROLLOUT), "--verbose", "0", "--eval-freq", "-1"]
+    run = train.train([*argv, "-params", "update_threads:2"])
+    assert E2CMAPPO.load(run / f"{ENV}.zip", device="cpu").update_threads == 2
+
+
+@pytest.mark.parametrize("net_arch", [[60_000], {"pi": [60_000], "vf": [8]}])
+def test_networks_that_a_file_cannot_hold_are_refused(tmp_path, net_arch):
+    (tmp_path / "model.zip").write_bytes(bytes(1000))
+    with pytest.raises(UserError, match=r"has 1,000 bytes, but the networks in config\.yml 60,0"):
+        check_networks({"policy_kwargs": {"net_arch": net_arch}}, tmp_path / "model.zip")
 
 
 def test_continuing_refuses_another_method(copy, capsys):

@@ -142,6 +142,7 @@ def check_networks(config: Mapping[str, Any], path: str | Path) -> None:
     chains = list(layers.values()) if isinstance(layers, Mapping) else [layers]
     least = 3 * kwargs.get("gru_hidden_size", 0) ** 2
     least += sum(a * b for chain in chains for a, b in itertools.pairwise(chain))
+    least += sum(sum(chain) for chain in chains)  # biases
     found = os.path.getsize(path) if os.path.exists(path) else math.inf
     if least > found:  # a weight has four bytes, and hardly compresses
         raise UserError(

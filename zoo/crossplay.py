@@ -9,7 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 from tqdm.auto import tqdm
@@ -18,11 +18,12 @@ from sb3_e2c.opponents import adversary_path
 from sb3_e2c.zoo import enjoy
 from sb3_e2c.zoo.benchmark import parse_seeds
 from sb3_e2c.zoo.console import ConsoleParser, UserError, one_line_errors, unknown, write_whole
-from sb3_e2c.zoo.results import CROSSPLAY, Place, evaluation_numbers, read_table
+from sb3_e2c.zoo.results import CROSSPLAY, Place, evaluation_numbers, read_json, read_table
 from sb3_e2c.zoo.suite import Suite, find_suite, read_suite
 
 _SEED = 2_000_000  # worlds in which nobody has trained or been evaluated
 _WHO = ["env", "label", "seed", "opponent"]
+_WHICH = [*_WHO, "trained", "opponent_trained", "episodes"]
 
 
 def make_parser() -> ConsoleParser:
@@ -59,47 +60,68 @@ def adversary(place: Place) -> Path:
     return adversary_path((place.run or place.work) / f"{place.job.env}.zip")
 
 
-def opponents(place: Place, pool: Sequence[Place]) -> dict[str, str]:
-    """Names of a team's opponents, and what ``enjoy --opponent`` calls them.
+class Opponent(NamedTuple):
+    """Somebody to play against.
+
+    :param word: What ``enjoy --opponent`` calls it
+    :param trained: When its run finished; empty if it is no other run's
+    """
+
+    word: str
+    trained: str = ""
+
+
+def opponents(place: Place, pool: Sequence[Place]) -> dict[str, Opponent]:
+    """A team's opponents by name.
 
     :param place: The team's job
     :param pool: Jobs whose adversaries play
     """
     others = [each for each in pool if each.job.env == place.job.env and each != place]
-    named = {f"{p.job.method.label}/seed_{p.job.seed}": str(adversary(p)) for p in others}
-    return {"own": "own", "random": "random"} | named
+    named = {
+        f"{p.job.method.label}/seed_{p.job.seed}": Opponent(str(adversary(p)), _finished(p))
+        for p in others
+    }
+    return {"own": Opponent("own"), "random": Opponent("random")} | named
 
 
-def play(place: Place, against: dict[str, str], n_episodes: int) -> Iterator[dict[str, Any]]:
+def _finished(place: Place) -> str:
+    return str(read_json(place.done)["finished"])
+
+
+def play(place: Place, against: dict[str, Opponent], n_episodes: int) -> Iterator[dict[str, Any]]:
     """Rows of the table for one team.
 
     :param place: Its job
     :param against: See :func:`opponents`
     :param n_episodes: Against each
     """
-    job = place.job
+    job, trained = place.job, _finished(place)
     flags = ["--algo", job.method.algo, "--env", job.env, "-f", str(place.log_folder)]
-    flags += [
-        "--n-episodes",
-        str(n_episodes),
-        "--n-envs",
-        str(min(n_episodes, 64)),
-        "--verbose",
-        "0",
-    ]
-    flags += ["--seed", str(_SEED + 100 * job.seed), "--opponent", *against.values()]
+    flags += ["--n-episodes", str(n_episodes), "--n-envs", str(min(n_episodes, 64))]
+    flags += ["--seed", str(_SEED + 100 * job.seed), "--verbose", "0"]
+    flags += ["--opponent", *(each.word for each in against.values())]
     result = enjoy.enjoy(enjoy.make_parser().parse_args(flags))
-    for name, each in zip(against, result["against"], strict=True):
+    for (name, opponent), each in zip(against.items(), result["against"], strict=True):
         who = dict(zip(_WHO, (job.env, job.method.label, job.seed, name), strict=True))
-        yield who | {"episodes": each["episodes"]} | evaluation_numbers(each)
+        when = {"trained": trained, "opponent_trained": opponent.trained}
+        yield who | when | {"episodes": each["episodes"]} | evaluation_numbers(each)
 
 
-def _missing(done: pd.DataFrame, place: Place, against: dict[str, str]) -> dict[str, str]:
-    """Those opponents that a team has not met yet."""
+def _is_of(table: pd.DataFrame, place: Place) -> "pd.Series[bool]":
     job = place.job
-    mine = (done["env"] == job.env) & (done["label"] == job.method.label)
-    met = set(done[mine & (done["seed"] == job.seed)]["opponent"])
-    return {name: word for name, word in against.items() if name not in met}
+    mine = (table["env"] == job.env) & (table["label"] == job.method.label)
+    return mine & (table["seed"] == job.seed)
+
+
+def _up_to_date(
+    table: pd.DataFrame, place: Place, against: dict[str, Opponent], n_episodes: int
+) -> pd.DataFrame:
+    """A team's rows that need not be played again: as many episodes, of the same two runs."""
+    rows = table[_is_of(table, place)]
+    trained = [getattr(against.get(name), "trained", None) for name in rows["opponent"]]
+    good = (rows["episodes"] == n_episodes) & (rows["trained"] == _finished(place))
+    return rows[good & (rows["opponent_trained"] == pd.Series(trained, rows.index, dtype=object))]
 
 
 def crossplay(args: argparse.Namespace) -> Path:
@@ -122,12 +144,19 @@ def crossplay(args: argparse.Namespace) -> Path:
             "seeds; run the benchmark first, or choose others with --pool and --pool-seeds"
         )
     path = args.folder / "results" / suite.name / CROSSPLAY
-    table = read_table(path) if path.is_file() else pd.DataFrame(columns=_WHO)
+    table = pd.DataFrame(columns=_WHICH)
+    if path.is_file():
+        table = read_table(path, keep_default_na=False, na_values={"lambda": ""})
     for place in tqdm(found):
-        against = _missing(table, place, opponents(place, pool))
-        if against:
-            rows = pd.DataFrame(play(place, against, args.n_episodes))
-            table = rows if table.empty else pd.concat([table, rows], ignore_index=True)
+        against = opponents(place, pool)
+        kept = _up_to_date(table, place, against, args.n_episodes)
+        missing = {
+            name: each for name, each in against.items() if name not in set(kept["opponent"])
+        }
+        if missing:
+            rows = pd.DataFrame(play(place, missing, args.n_episodes))
+            others = table[~_is_of(table, place)]
+            table = pd.concat([each for each in (others, kept, rows) if len(each)])
             write_whole(path, table.to_csv(index=False, float_format="%.6g"))
     return path
 

@@ -59,6 +59,7 @@ _CHANGEABLE = (
     *("learning_rate", "critic_learning_rate", "clip_range", "clip_range_vf"),
     *("ent_coef", "vf_coef", "max_grad_norm", "n_steps"),
     *("batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "reward_scale"),
+    "update_threads",
 )
 
 
@@ -88,7 +89,8 @@ def configure(args: Namespace) -> dict[str, Any]:
         _conf_file(args), {"env_kwargs": args.env_kwargs or {}}, args.hyperparams or {}
     )
     base = _continued_configuration(args)
-    _check_callback(args, base or {}, overrides)
+    if base is not None and not args.trust:
+        base = _without_callback(base, overrides)
     config = resolve(args.algo, args.env, parse_presets(args.preset), overrides, base)
     if base is not None:
         _check_changes(base, config)
@@ -116,13 +118,17 @@ def _continued_configuration(args: Namespace) -> dict[str, Any] | None:
     return read_yaml(saved / "config.yml")
 
 
-def _check_callback(args: Namespace, old: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
-    """Refuse to run code that a file from elsewhere may have named."""
-    if old.get("callback") and "callback" not in overrides and not args.trust:
+def _without_callback(old: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out code that a file from elsewhere may have named; the user's own takes its place.
+
+    :raises UserError: if the user gave none
+    """
+    if old.get("callback") and "callback" not in overrides:
         raise UserError(
             f"-i: the run's config.yml names a callback, {brief(old['callback'])}, which is code; "
             "say --trust if you want it to run, or -params callback:null to do without"
         )
+    return {key: value for key, value in old.items() if key != "callback"}
 
 
 def _check_changes(old: dict[str, Any], new: dict[str, Any]) -> None:

@@ -242,8 +242,8 @@ def _read_content(path: Path) -> dict[str, Any]:
     _check_keys(path, "", content, _SUITE)
     base = content.pop("base", None)
     if base is not None:
-        if base not in suite_names() or base == path.stem:
-            others = [name for name in suite_names() if name != path.stem]
+        others = [name for name in suite_names() if find_suite(name).resolve() != path.resolve()]
+        if base not in others:
             raise UserError(f"{path}: {unknown('suite (base)', base, others)}")
         content = merge(_read_content(FOLDER / f"{base}.yml"), content)
     _check_keys(path, "", content, _SUITE, required=("methods", "experiments"))

@@ -15,6 +15,7 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch as th
@@ -55,19 +56,20 @@ def measure(pid="self"):
 
 
 def held(thing, seen=None):
-    """Bytes of arrays and strings that an object holds, without models, worlds and loggers."""
+    """Bytes of all that an object holds, without models, worlds and loggers."""
     seen = set() if seen is None else seen
-    if id(thing) in seen or isinstance(thing, (BaseAlgorithm, VecEnv, Logger, type)):
+    if id(thing) in seen or isinstance(thing, (BaseAlgorithm, VecEnv, Logger, type, ModuleType)):
         return 0
     seen.add(id(thing))
     if isinstance(thing, (np.ndarray, th.Tensor)):
         return thing.nbytes
-    if isinstance(thing, (bytes, bytearray, str)):
-        return len(thing)
-    inner = list(thing.values()) if isinstance(thing, dict) else getattr(thing, "__dict__", {})
-    inner = list(inner.values()) if isinstance(inner, dict) else inner
-    inner += list(thing) if isinstance(thing, (list, tuple, set, deque)) else []
-    return sum(held(each, seen) for each in inner)
+    names = [n for kind in type(thing).__mro__ for n in getattr(kind, "__slots__", ())]
+    inner = [getattr(thing, name) for name in names if hasattr(thing, name)]
+    inner += vars(thing).values() if hasattr(thing, "__dict__") else []
+    if isinstance(thing, dict):
+        inner += [*thing, *thing.values()]
+    inner += thing if isinstance(thing, (list, tuple, set, deque)) else []
+    return sys.getsizeof(thing) + sum(held(each, seen) for each in inner)
 
 
 def inside(callbacks, model):
