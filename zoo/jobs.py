@@ -160,6 +160,7 @@ def _evaluate(place: Place, mode: str) -> dict[str, Any]:
     enjoy.main([*flags, *(["--deterministic"] if mode == "deterministic" else [])])
     result = read_json(path)
     result.pop("model")  # a path on this machine
+    result.pop("against", None)  # its own adversary only: the same numbers again
     return result
 
 
