@@ -28,13 +28,15 @@ class Physics(ABC):
     :param model: the model
     :param n_worlds: W
     :param n_threads: threads that step worlds, the calling one included
+
+    Subclasses add themselves to ``_LIVING`` when they are complete: a fork calls
+    :meth:`lose_threads` of all that stand there.
     """
 
     def __init__(self, model: mujoco.MjModel, n_worlds: int, n_threads: int) -> None:
         self.model = model
         self.n_worlds = n_worlds
         self.n_threads = n_threads
-        _LIVING.add(self)
 
     @abstractmethod
     def restart(self, worlds: np.ndarray, starts: list[Start]) -> Snapshot:
@@ -114,6 +116,7 @@ class ThreadedPhysics(Physics):
         self.needs_contact = needs_contact
         self._windows = [_windows(model, data, needs_contact) for data in self.datas]
         self._pool: ThreadPoolExecutor | None = None
+        _LIVING.add(self)
 
     def restart(self, worlds: np.ndarray, starts: list[Start]) -> Snapshot:
         """Put R worlds at time 0 with these positions and velocities, and read them."""
@@ -203,6 +206,7 @@ class BatchPhysics(Physics):
         self._batch: Any = None
         self._controls = np.empty(0)
         self._live: Snapshot | None = None
+        _LIVING.add(self)
 
     def _started(self) -> Any:
         """The batch, a new one if there is none."""

@@ -7,14 +7,15 @@ Python's, which Stable-Baselines3 asks for.
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 
-_LARGEST = float(th.finfo(th.float32).max)
+from sb3_e2c.multipliers import LARGEST, fits_torch
 
 
 class Rule(NamedTuple):
@@ -105,19 +106,14 @@ def _device(value: Any) -> str | th.device:
     return value
 
 
-def _fits_torch(number: float) -> bool:
-    """Whether torch takes it beside the networks' numbers."""
-    return number <= _LARGEST or number == math.inf
-
-
 # ---------------------------------------------------------------------------- the table
 
 COUNT = _whole("a whole number of at least 1", 1)
 SHARE = _number("a number from 0 to 1", lambda number: 0 <= number <= 1)
-AMOUNT = _number("a number of at least 0", lambda number: number >= 0 and _fits_torch(number))
-FACTOR = _number(f"a number from 0 to {_LARGEST:.1e}", lambda number: 0 <= number <= _LARGEST)
+AMOUNT = _number("a number of at least 0", lambda number: number >= 0 and fits_torch(number))
+FACTOR = _number(f"a number from 0 to {LARGEST:.1e}", lambda number: 0 <= number <= LARGEST)
 FINITE = _number("a finite number of at least 0", lambda number: 0 <= number < math.inf)
-POSITIVE = _number("a number greater than 0", lambda number: number > 0 and _fits_torch(number))
+POSITIVE = _number("a number greater than 0", lambda number: number > 0 and fits_torch(number))
 SWITCH = Rule("True or False", lambda value: bool(_a("", bool, np.bool_).accept(value)))
 KEYWORDS = Rule("a dict of arguments by their names, or None", _mapping)
 
@@ -174,6 +170,24 @@ def settle(model: Any) -> None:
     """
     for name in ATTRIBUTES:
         setattr(model, name, checked(name, getattr(model, name)))
+
+
+@contextmanager
+def making(model: Any, policy_kwargs: Any) -> Iterator[None]:
+    """Say of an error in torch or NumPy which arguments it comes from.
+
+    :param model: Its rollout buffer and networks are made inside
+    :param policy_kwargs: What the user gave
+    :raises ValueError: also for networks that begin with numbers that are not finite
+    """
+    given = f"n_steps={model.n_steps}, policy_kwargs={policy_kwargs}"
+    try:
+        yield
+    except (TypeError, ValueError, AssertionError, OverflowError) as error:
+        raise ValueError(f"{error}; found in {given}") from error
+    for name, parameter in model.policy.named_parameters():
+        if not th.isfinite(parameter).all():
+            raise ValueError(f"{name} begins with numbers that are not finite; found in {given}")
 
 
 def _shown(value: Any) -> str:

@@ -31,7 +31,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_e2c.arguments import checked, settle
+from sb3_e2c.arguments import checked, making, settle
 from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
 from sb3_e2c.constraints import (
     CostScope,
@@ -52,7 +52,7 @@ from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory
-from sb3_e2c.teams import check_batch, check_subclass, check_team, making, monitored, team_of
+from sb3_e2c.teams import check_batch, check_subclass, check_team, monitored, team_of
 from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"

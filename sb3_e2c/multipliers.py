@@ -12,7 +12,15 @@ from typing import Any
 import torch as th
 from torch import nn
 
-_LARGEST = float(th.finfo(th.float32).max)
+LARGEST = float(th.finfo(th.float32).max)
+
+
+def fits_torch(number: float) -> bool:
+    """Whether torch takes a number beside the networks' numbers.
+
+    :param number: Not negative; infinity fits
+    """
+    return number <= LARGEST or number == math.inf
 
 
 class Multipliers(nn.Module, ABC):
@@ -137,7 +145,7 @@ def _check_form(shape: Any, agent_scaling: Any) -> None:
 def _check(initial: float, maximum: float, **gains: float) -> None:
     for name, value in {"initial": initial, "maximum": maximum, **gains}.items():
         is_number = isinstance(value, Real) and not isinstance(value, bool)
-        if not is_number or not value >= 0 or _LARGEST < value < math.inf:
+        if not is_number or not value >= 0 or not fits_torch(value):
             raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")
     if not math.isfinite(initial) or initial > maximum:
         raise ValueError(

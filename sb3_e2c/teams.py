@@ -1,11 +1,7 @@
 """What an algorithm needs to know of its team, and what it refuses."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import torch as th
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
@@ -78,21 +74,3 @@ def check_subclass(name: str, given: Any, kind: type) -> None:
     """
     if not isinstance(given, type) or not issubclass(given, kind):
         raise TypeError(f"{name} is {given!r}; expected a subclass of {kind.__name__}")
-
-
-@contextmanager
-def making(model: OnPolicyAlgorithm, policy_kwargs: Any) -> Iterator[None]:
-    """Say of an error in torch or NumPy which arguments it comes from.
-
-    :param model: Its rollout buffer and networks are made inside
-    :param policy_kwargs: What the user gave
-    :raises ValueError: also for networks that begin with numbers that are not finite
-    """
-    given = f"n_steps={model.n_steps}, policy_kwargs={policy_kwargs}"
-    try:
-        yield
-    except (TypeError, ValueError, AssertionError, OverflowError) as error:
-        raise ValueError(f"{error}; found in {given}") from error
-    for name, parameter in model.policy.named_parameters():
-        if not th.isfinite(parameter).all():
-            raise ValueError(f"{name} begins with numbers that are not finite; found in {given}")

@@ -174,7 +174,7 @@ class TrustRegionMonitor(BaseCallback):
         self._predicted: dict[str, np.ndarray] = {}
         self._levels: dict[str, np.ndarray] = {}
         self._epochs = 0
-        self._follow_actor()
+        self._raw: th.Tensor | None = None  # (B·N, A)
         if self._limits_epochs:
             self.model.stop_epochs = self._goes_too_far
 
@@ -182,10 +182,10 @@ class TrustRegionMonitor(BaseCallback):
         """Keep what the actor's last layer says: the buffer has no action distributions.
 
         The last thing before the end of a rollout is to evaluate all of it, with the old policy;
-        listening there saves another pass.
+        listening there saves another pass. Networks to which nobody listens learn faster.
         """
         self._release()
-        self._raw: th.Tensor | None = None  # (B·N, A)
+        self._raw = None
         buffer = self.model.rollout_buffer
         self._n_rows = buffer.buffer_size * buffer.n_envs
         layer = getattr(self.model.policy, "action_net", None)
@@ -203,7 +203,7 @@ class TrustRegionMonitor(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._report_update()
-        self._raw = None
+        self._follow_actor()
         self._first_ages = self._ages
         self._ends: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -217,6 +217,7 @@ class TrustRegionMonitor(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self._learned_from = rollout = self._keep_rollout()
+        self._release()
         if not rollout.begins:
             self._warn_once(
                 "episodes",
@@ -284,8 +285,10 @@ class TrustRegionMonitor(BaseCallback):
         """Compare the policy as it is now with the one that collected the rollout."""
         buffer, policy = rollout.buffer, self.model.policy
         rows, sequences = team_rows(buffer, rollout.initial)
+        self._follow_actor()
         with _evaluating(policy), th.no_grad(), self.model._explained_divergence():
             log_prob = _log_prob(policy, buffer, rows, sequences)
+        self._release()
         new = ActorOutputs(self._raw, _log_std(policy), log_prob.cpu().view(-1, buffer.n_agents))
         log_ratios = (new.log_prob - rollout.old.log_prob).double().numpy()
         kls = agent_kls(policy.action_dist, rollout.old, new)

@@ -93,6 +93,14 @@ def test_more_episodes_or_a_new_training_are_played_anew(played, monkeypatch):
     crossplay.main(flags)
 
 
+def test_a_table_that_does_not_say_which_runs_met_is_played_anew(played):
+    _, flags, path = played
+    rows = path.read_text()
+    pd.read_csv(path).drop(columns=["trained", "opponent_trained"]).to_csv(path, index=False)
+    crossplay.main(flags)
+    assert sorted(path.read_text().splitlines()) == sorted(rows.splitlines())
+
+
 def test_the_report_shows_it(played):
     report = plot.plot_suite(played[2].parent, played[0] / "plots")
     assert "adversaries of other runs (pool)" in report.read_text()

@@ -499,7 +499,10 @@ def test_local_observations_are_those_of_gymnasium_robotics_over_the_same_robot(
     mine = safe_mamujoco_v0.SafeMAMuJoCoEnv(config)
     observations, _ = mine.reset(seed=1)
     their_observations, _ = theirs.reset(seed=1)
+    for index, agent in enumerate(mine.possible_agents):
+        mine.action_space(agent).seed(index)  # with other actions the Ant may fall in between
     for _ in range(15):
+        assert mine.agents
         for agent in mine.agents:
             assert observations[agent].shape == (size,)
             np.testing.assert_array_equal(
@@ -779,6 +782,27 @@ status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if child else 0
 print(moved.tolist(), flush=True)
 sys.exit(status)
 """
+
+
+@pytest.mark.parametrize("needs_contact", [False, True])
+def test_a_fork_while_a_simulator_is_being_made_does_not_touch_it(monkeypatch, needs_contact):
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body/></worldbody></mujoco>")
+    real, calls = mujoco.mj_name2id, []
+
+    def forked(*args):
+        calls.append(args)
+        assert all(hasattr(each, "_pool") or hasattr(each, "_batch") for each in made())
+        return real(*args)
+
+    before = set(_mujoco_physics._LIVING)
+
+    def made():
+        return set(_mujoco_physics._LIVING) - before
+
+    monkeypatch.setattr(_mujoco_physics.mujoco, "mj_name2id", forked)
+    physics = _mujoco_physics.new_physics(model, 1, needs_contact)
+    assert calls
+    assert made() == {physics}
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes are forked here")

@@ -17,7 +17,7 @@ if sys.platform != "linux":
 from torture import crash, fuzz, hub, soak, untrusted
 from torture.runs import PREY, flags, results, run_in, trained, wait
 
-from sb3_e2c.zoo import build, train
+from sb3_e2c.zoo import build, load, train
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +87,34 @@ def test_a_traceback_and_a_hang_are_seen(monkeypatch):
     assert found.wrong >= 2
     assert any("KeyError" in note for note in found.notes)
     assert any("hang" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("message", "given", "names"),
+    [
+        ("k is 0; expected at least 1", {"k": 0}, True),
+        ("broken", {"k": 3}, False),  # a letter of a word
+        ("gamma is {'psi': 1}; expected a number", {"psi": 2}, False),  # stands in a value
+        ("boom; found in n_steps=4, policy_kwargs={}", {"n_steps": None}, False),
+        ("boom; found in n_steps=4, policy_kwargs={}", {"policy": int}, False),
+        ("policy_class is 3; expected a subclass", {"policy": 3}, True),
+        ("oem_kwargs: psi is nan; expected a number", {"oem_kwargs": {"psi": "nan"}}, True),
+    ],
+)
+def test_a_message_names_an_argument_by_a_whole_word_before_its_value(message, given, names):
+    assert (fuzz._nameless(message, given) is None) is names
+
+
+@pytest.mark.parametrize(("culprit", "clear"), [("policy_kwargs", True), ("psi", False)])
+def test_what_an_error_is_found_in_counts_only_if_it_is_the_cause(culprit, clear, monkeypatch):
+    monkeypatch.setattr(fuzz, "_unclear", lambda error: None)  # it is not raised by the library
+
+    def act(given):
+        if culprit in given:
+            raise ValueError("boom; found in n_steps=4, policy_kwargs={'a': 1}")
+
+    found = fuzz.clear(act, {"policy_kwargs": {"a": 1}, "psi": 2})
+    assert (found is None) is clear
 
 
 # ---------------------------------------------------------------------------- a stranger's run
@@ -186,8 +214,22 @@ def test_what_a_hub_lists_makes_sense_or_is_refused_in_one_line(team, tmp_path, 
     assert hub.attempt(server, tmp_path, tmp_path / "executed") == "refused"
 
 
-def test_an_honest_hub_is_loaded_from(team, tmp_path):
+def test_an_honest_hub_is_loaded_from_and_what_is_written_is_measured(team, tmp_path):
     assert hub.attempt(hub.Hub(team), tmp_path, tmp_path / "executed") == "works"
+    n_bytes = int((tmp_path / "logs.written").read_text())
+    assert sum(map(len, team.values())) <= n_bytes < sum(map(len, team.values())) + hub.LARGE
+
+
+def test_a_hub_that_fills_the_disk_would_be_seen(team, tmp_path, monkeypatch):
+    real = load.fetch
+
+    def fetch(repo_id, revision, file, path):  # as if sizes were checked too late
+        file.size = (file.size or 0) + 2 * hub.LARGE
+        real(repo_id, revision, file, path)
+
+    monkeypatch.setattr(load, "fetch", fetch)
+    server = hub.Hub(team, send=hub.of_model(hub.SENDS["more than listed"]))
+    assert "bytes written" in hub.attempt(server, tmp_path, tmp_path / "executed")
 
 
 # ---------------------------------------------------------------------------- soak
@@ -229,6 +271,17 @@ class _Slots:
     __slots__ = ("rows",)
 
 
+class _OneSlot:
+    __slots__ = "rows"
+
+
+class _PrivateSlot:
+    __slots__ = ("__rows",)
+
+    def __init__(self):
+        self.__rows = np.zeros(10_000)
+
+
 def test_numbers_and_slots_are_counted_too():
     slots = _Slots()
     slots.rows = np.zeros(10_000)
@@ -236,6 +289,17 @@ def test_numbers_and_slots_are_counted_too():
     assert soak.held({"x": floats}) > 10_000 * (8 + 24)
     assert soak.held([{"r": i} for i in range(1000)]) > 1000 * 64
     assert soak.held(slots) > 80_000
+    one = _OneSlot()
+    one.rows = slots.rows
+    assert soak.held(one) > 80_000
+    assert soak.held(_PrivateSlot()) > 80_000
+
+
+def test_a_long_chain_of_objects_is_counted():
+    chain = []
+    for _ in range(10_000):
+        chain = [chain]
+    assert soak.held(chain) > 10_000 * 56  # of a list with one place
 
 
 def test_a_long_training_does_not_grow(tmp_path):

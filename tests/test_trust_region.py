@@ -76,7 +76,7 @@ class Scripted(MAPPO):
         play = self.plays[min(self.n_rollouts, len(self.plays) - 1)]
         return th.as_tensor(play[self.rollout_buffer.pos].ravel()), states
 
-    def _train_epoch(self, samples, logs):
+    def _train_epoch(self, samples, descent, logs):
         play_fast_with(self, next(self.moves))
         logs["loss"] = logs["approx_kl"] = logs["cost_value_loss"] = [0.0]
         return True

@@ -491,11 +491,18 @@ def test_a_run_that_goes_on_may_use_other_threads(copy):
     assert E2CMAPPO.load(run / f"{ENV}.zip", device="cpu").update_threads == 2
 
 
-@pytest.mark.parametrize("net_arch", [[60_000], {"pi": [60_000], "vf": [8]}])
-def test_networks_that_a_file_cannot_hold_are_refused(tmp_path, net_arch):
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"net_arch": [60_000]},
+        {"net_arch": {"pi": [60_000], "vf": [8]}},
+        {"features_extractor_kwargs": {"features_dim": 60_000}},
+    ],
+)
+def test_networks_that_a_file_cannot_hold_are_refused(tmp_path, kwargs):
     (tmp_path / "model.zip").write_bytes(bytes(1000))
     with pytest.raises(UserError, match=r"has 1,000 bytes, but the networks in config\.yml 60,0"):
-        check_networks({"policy_kwargs": {"net_arch": net_arch}}, tmp_path / "model.zip")
+        check_networks({"policy_kwargs": kwargs}, tmp_path / "model.zip")
 
 
 def test_continuing_refuses_another_method(copy, capsys):

@@ -26,7 +26,7 @@ from sb3_e2c.zoo.archives import check_archive
 from sb3_e2c.zoo.configuration import ALGORITHMS, ZOO_KEYS
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.parts import CLASSES, class_named
-from sb3_e2c.zoo.signatures import schedule_start
+from sb3_e2c.zoo.signatures import numbers_in, schedule_start
 
 _KEPT_NAMES = ("policy", "estimator")  # the library looks them up itself
 # What constructors raise for arguments that they cannot take
@@ -143,8 +143,10 @@ def check_networks(config: Mapping[str, Any], path: str | Path) -> None:
     least = 3 * kwargs.get("gru_hidden_size", 0) ** 2
     least += sum(a * b for chain in chains for a, b in itertools.pairwise(chain))
     least += sum(sum(chain) for chain in chains)  # biases
+    extractor = numbers_in(kwargs.get("features_extractor_kwargs"))
+    least += sum(width for width in extractor if width > 0)  # each may be a layer's
     found = os.path.getsize(path) if os.path.exists(path) else math.inf
-    if least > found:  # a weight has four bytes, and hardly compresses
+    if 0 < found < least:  # a weight has four bytes, and hardly compresses
         raise UserError(
             f"{path} has {found:,} bytes, but the networks in config.yml {least:,} weights; does "
             "it belong to this run?"

@@ -147,6 +147,9 @@ def crossplay(args: argparse.Namespace) -> Path:
     table = pd.DataFrame(columns=_WHICH)
     if path.is_file():
         table = read_table(path, keep_default_na=False, na_values={"lambda": ""})
+        # An older version did not say who met: all is played anew
+        numbers = [name for name in table if name not in _WHICH]
+        table = table.reindex(columns=[*_WHICH, *numbers], fill_value="")
     for place in tqdm(found):
         against = opponents(place, pool)
         kept = _up_to_date(table, place, against, args.n_episodes)

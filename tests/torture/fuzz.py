@@ -9,6 +9,7 @@ import contextlib
 import inspect
 import io
 import os
+import re
 import signal
 import traceback
 import warnings
@@ -418,7 +419,7 @@ numbers = st.one_of(
     st.sampled_from([None, "a", "", [], {}, [1, 2], (), "lin_0.1", b"a", len, float, object()]),
 )
 optimizer_kwargs = st.dictionaries(
-    st.sampled_from(["eps", "betas", "lr", "a"]), numbers, max_size=2
+    st.sampled_from(["eps", "betas", "lr", "strange"]), numbers, max_size=2
 )
 schedules = st.sampled_from([LinearSchedule(0.3, 0.0, 1.0), LinearSchedule(0.1, -0.1, 1.0), abs])
 SENSIBLE = {
@@ -442,7 +443,7 @@ SENSIBLE = {
         st.sampled_from(
             [
                 *("net_arch", "activation_fn", "gru_hidden_size", "ortho_init", "log_std_init"),
-                *("optimizer_class", "optimizer_kwargs", "features_extractor_class", "a"),
+                *("optimizer_class", "optimizer_kwargs", "features_extractor_class", "strange"),
                 *("share_features_extractor", "squash_output", "use_sde", "normalize_images"),
             ]
         ),
@@ -468,31 +469,53 @@ def arguments(names, most=3):
     )
 
 
-def clear(act, given=None):
+def clear(act, given, named=True):
     """None if it works, or refuses clearly; else what is wrong.
 
-    :param act: Calls a constructor
-    :param given: Its odd arguments; the message has to name one, or an argument inside one
+    :param act: Calls a constructor with the arguments
+    :param given: Odd arguments
+    :param named: Whether the message has to name one of them, or an argument inside one
     """
+    error = _refusal(act, given)
+    if error is None:
+        return None
+    message = str(error).lower()
+    fits = not named or _is_of_found_in(message, act, given)
+    return _unclear(error) or (None if fits else _nameless(message, given))
+
+
+def _refusal(act, given):
     try:
-        act()
+        act(given)
     except (ValueError, TypeError, gymnasium.error.Error) as error:
-        return _unclear(error) or _nameless(str(error).lower(), given)
+        return error
     return None
 
 
+def _is_of_found_in(message, act, given):
+    """Whether an error of torch or NumPy comes from what it was "found in": is it gone without?"""
+    others = {name: given[name] for name in given if name not in ("n_steps", "policy_kwargs")}
+    what, _, where = message.partition("; found in ")
+    if not where or len(others) == len(given):
+        return False
+    return str(_refusal(act, others)).lower().partition("; found in ")[0] != what
+
+
 def _nameless(message, given):
-    names = [name for each in (given or {}).items() for name in _names(*each)]
-    others = ["missing", "training stops"]  # what is missing; numbers that are large in effect
-    if given is None or any(name in message for name in [*names, *others]):
+    """None if a message names an argument before it shows a value; what a value says is no name."""
+    said = re.split(r" is |; found in ", message)[0]
+    names = [name for each in given.items() for name in _names(*each)]
+    if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", said) for name in [*names, "missing"]):
+        return None
+    if "; training stops, " in message:  # numbers that are large in effect
         return None
     return f"names none of its arguments: {message[:100]}"
 
 
 def _names(name, value):
-    """An argument's name as in its messages ("policy_class", "high"), and of those inside."""
-    inner = [str(key) for key in value] if isinstance(value, dict) else []
-    return [name.lower(), name.removesuffix("_kwargs"), *inner]
+    """An argument's name, what Stable-Baselines3 says for it, and the names of those inside."""
+    inner = [str(key).lower() for key in value] if isinstance(value, dict) else []
+    return [name, {"policy": "policy_class", "env": "environment"}.get(name, name), *inner]
 
 
 def _unclear(error):
@@ -508,9 +531,9 @@ def try_model(case):
     small["policy_kwargs"] = {"net_arch": [4]}
     env = share_parameters(TwoOnALine, n_worlds=2)
 
-    def act():
+    def act(given):
         with contextlib.redirect_stdout(io.StringIO()):
-            model = kind(**{"env": env, **small, **kwargs})
+            model = kind(**{"env": env, **small, **given})
         if model.n_steps < 100 and model.n_epochs < 100:
             with contextlib.redirect_stdout(io.StringIO()):
                 model.learn(1)
@@ -520,13 +543,14 @@ def try_model(case):
 
 def try_part(case):
     kind, kwargs = case
-    return clear(lambda: kind(**kwargs), kwargs)
+    return clear(lambda given: kind(**given), kwargs)
 
 
 def try_worlds(kwargs):
-    return clear(
-        lambda: share_parameters(**{"make_env": TwoOnALine, "n_worlds": 1, **kwargs}).close()
-    )
+    def act(given):
+        share_parameters(**{"make_env": TwoOnALine, "n_worlds": 1, **given}).close()
+
+    return clear(act, kwargs, named=False)
 
 
 PARTS = [

@@ -23,7 +23,7 @@ from torture.untrusted import WORDS, Payload, _judge, _pour, commands, in_data, 
 
 REPO, SHA = "somebody/prey", "0123456789abcdef0123456789abcdef01234567"
 SECONDS = 60.0  # this machine may be busy
-LARGE = 2**21  # bytes more than the model has; nobody is to write so much to our disk
+LARGE = 2**21  # bytes more than the files have; nobody is to write so much to our disk
 
 
 class Hub(http.server.ThreadingHTTPServer):
@@ -247,7 +247,17 @@ def _load(logs, port, trace):
     constants.HUGGINGFACE_CO_URL_TEMPLATE = template
     load._SILENCE, load._PATIENCE = 1.0, 2.0
     signal.alarm(int(SECONDS))  # ends this process
-    _judge(load.main, ["--repo-id", REPO, "-f", logs, "--verbose", "0"], trace)
+    before = written()
+    try:
+        _judge(load.main, ["--repo-id", REPO, "-f", logs, "--verbose", "0"], trace)
+    finally:
+        logs.with_suffix(".written").write_text(str(written() - before))
+
+
+def written():
+    """Bytes that this process has written to files so far, also to those that are gone."""
+    lines = Path("/proc/self/io").read_text().splitlines()
+    return int(dict(line.split(": ") for line in lines)["wchar"])
 
 
 def attempt(server, work, trace):
@@ -257,6 +267,8 @@ def attempt(server, work, trace):
     """
     logs, start = work / "logs", time.monotonic()
     shutil.rmtree(logs, ignore_errors=True)
+    note, listed_bytes = work / "logs.written", sum(map(len, server.files.values()))
+    note.unlink(missing_ok=True)
     before = set(work.rglob("*"))
     with server:
         threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
@@ -264,7 +276,10 @@ def attempt(server, work, trace):
         server.shutdown()
     if time.monotonic() - start > SECONDS:
         return "slow"
-    left = set(work.rglob("*")) - before - {logs}
+    n_bytes = int(note.read_text()) if note.exists() else 0
+    left = set(work.rglob("*")) - before - {logs, note}
+    if n_bytes > listed_bytes + LARGE:
+        return f"{n_bytes:,} bytes written"
     if any(logs not in path.parents for path in left):
         return "a file outside of the log folder"
     if status == 9 and left:

@@ -9,13 +9,14 @@ Linux only: it reads /proc.
 
 import argparse
 import csv
+import functools
 import os
 import signal
 import sys
 import time
 from collections import deque
 from pathlib import Path
-from types import ModuleType
+from types import MemberDescriptorType, ModuleType
 
 import numpy as np
 import torch as th
@@ -55,21 +56,42 @@ def measure(pid="self"):
 # ---------------------------------------------------------------------------- inside the training
 
 
-def held(thing, seen=None):
+LEFT_OUT = (BaseAlgorithm, VecEnv, Logger, type, ModuleType)
+PLAIN = {bool, int, float, complex, str, bytes, bytearray, type(None)}
+
+
+def held(thing):
     """Bytes of all that an object holds, without models, worlds and loggers."""
-    seen = set() if seen is None else seen
-    if id(thing) in seen or isinstance(thing, (BaseAlgorithm, VecEnv, Logger, type, ModuleType)):
-        return 0
-    seen.add(id(thing))
-    if isinstance(thing, (np.ndarray, th.Tensor)):
-        return thing.nbytes
-    names = [n for kind in type(thing).__mro__ for n in getattr(kind, "__slots__", ())]
-    inner = [getattr(thing, name) for name in names if hasattr(thing, name)]
+    total, waiting, seen = 0, [thing], set()
+    while waiting:
+        each = waiting.pop()
+        plain = type(each) in PLAIN  # asked first, because abstract classes are slow to ask
+        if id(each) in seen or (not plain and isinstance(each, LEFT_OUT)):
+            continue
+        seen.add(id(each))
+        if not plain and isinstance(each, (np.ndarray, th.Tensor)):
+            total += each.nbytes
+            continue
+        total += sys.getsizeof(each)
+        waiting += [] if plain else _inner(each)
+    return total
+
+
+def _inner(thing):
+    inner = [getattr(thing, name) for name in _slots(type(thing)) if hasattr(thing, name)]
     inner += vars(thing).values() if hasattr(thing, "__dict__") else []
     if isinstance(thing, dict):
         inner += [*thing, *thing.values()]
-    inner += thing if isinstance(thing, (list, tuple, set, deque)) else []
-    return sys.getsizeof(thing) + sum(held(each, seen) for each in inner)
+    inner += thing if isinstance(thing, (list, tuple, set, frozenset, deque)) else []
+    return inner
+
+
+@functools.cache
+def _slots(kind):
+    """Attributes of ``__slots__`` by the names under which they are stored, private ones too."""
+    bases = [vars(base) for base in kind.__mro__ if "__slots__" in vars(base)]
+    pairs = [pair for base in bases for pair in base.items()]
+    return [name for name, member in pairs if isinstance(member, MemberDescriptorType)]
 
 
 def inside(callbacks, model):
