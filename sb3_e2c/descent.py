@@ -5,6 +5,7 @@ so that a run can be repeated bit for bit. Python threads suit it better than to
 wait for each other in every operation of some 50 µs, ours once in a minibatch.
 """
 
+import math
 import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
@@ -106,7 +107,7 @@ class Descent:
         """
         pieces = [piece for piece in self._passes[0].gradient.split(self._sizes) if len(piece)]
         norms = [piece.dot(piece).sqrt().item() for piece in pieces]
-        if all(map(_is_finite, norms)):
+        if all(map(math.isfinite, norms)):
             for piece, norm in zip(pieces, norms, strict=True):
                 if norm + 1e-6 > max_norm:  # as torch's clip_grad_norm_
                     piece.mul_(max_norm / (norm + 1e-6))
@@ -122,10 +123,6 @@ def _one_torch_thread() -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(before)
-
-
-def _is_finite(number: float) -> bool:
-    return number - number == 0
 
 
 def _part(

@@ -6,7 +6,6 @@ files under FOLDER/results are what sb3-e2c plot draws, also while the benchmark
 """
 
 import argparse
-import os
 import re
 import shlex
 import signal
@@ -24,6 +23,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from sb3_e2c.descent import n_cores
 from sb3_e2c.zoo import jobs
 from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import (
@@ -62,13 +62,6 @@ def make_parser() -> ConsoleParser:
     add("--only", nargs="+", metavar="GLOB", default=[], help="EXPERIMENT/ENV/METHOD/seed_SEED")
     add("--dry-run", action="store_true", help="list what there is to do, and do nothing")
     return parser
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def parse_seeds(words: Sequence[str] | None) -> list[int] | None:
@@ -365,7 +358,7 @@ def benchmark(args: argparse.Namespace) -> list[Outcome]:
 
 def _make_pool(args: argparse.Namespace) -> Pool:
     if args.ray is None:
-        return LocalPool(args.jobs or _cores())
+        return LocalPool(args.jobs or n_cores())
     return RayPool(args.ray, args.jobs)
 
 

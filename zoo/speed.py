@@ -339,12 +339,6 @@ def make_parser() -> ConsoleParser:
         help="torch threads to try; each contender is judged by its best (default: 1 2)",
     )
     add(
-        "--clock",
-        choices=tuple(CLOCKS),
-        default="wall",
-        help="cpu: seconds that the processor worked for us, on a busy machine (default: wall)",
-    )
-    add(
         "--same-environment",
         action="store_true",
         help="ours, too, steps one world after the other through SuperSuit",
@@ -358,8 +352,23 @@ def make_parser() -> ConsoleParser:
         f"{', '.join(INSTALLED)} (if installed, always), or with the path of a checkout: "
         f"{', '.join(REPOSITORIES)}",
     )
-    add("--json", type=Path, metavar="FILE", help="write the results to FILE")
+    add_output_flags(parser)
     return parser
+
+
+def add_output_flags(parser: ConsoleParser) -> None:
+    """What seconds are, and where the results go.
+
+    :param parser: Of a benchmark
+    """
+    parser.add_argument(
+        "--clock",
+        choices=tuple(CLOCKS),
+        default="wall",
+        help="cpu: seconds that the processor worked for us, all threads together, for a busy "
+        "machine (default: wall)",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results to FILE")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -13,7 +13,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -26,7 +25,7 @@ from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.configuration import check_env
 from sb3_e2c.zoo.console import ConsoleParser, UserError, check_file, one_line_errors, write_whole
-from sb3_e2c.zoo.speed import CLOCKS
+from sb3_e2c.zoo.speed import CLOCKS, add_output_flags
 
 _FEW = 4  # worlds that are stepped one after the other: more of them are no faster
 _ROBOTS = {"SafeAnt-2x4-v0": ("Ant", "2x4"), "SafeHalfCheetah-2x3-v0": ("HalfCheetah", "2x3")}
@@ -177,13 +176,7 @@ def make_parser() -> ConsoleParser:
     add("--worlds", type=int, default=64, help="worlds of ours (default: 64)")
     add("--rounds", type=int, default=5, help="turns of each (default: 5)")
     add("--seconds", type=float, default=0.5, help="of a turn, at least (default: 0.5)")
-    add(
-        "--clock",
-        choices=tuple(CLOCKS),
-        default="wall",
-        help="cpu: seconds that the processor worked for us, threads together (default: wall)",
-    )
-    add("--json", type=Path, metavar="FILE", help="write the results to FILE")
+    add_output_flags(parser)
     return parser
 
 

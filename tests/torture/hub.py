@@ -184,7 +184,7 @@ SENDS = {
 }
 LISTINGS = {
     "a slip": more("../../slipped.py"),
-    "an absolute name": more("/tmp/slipped.py"),
+    "an absolute name": more("/slipped.py"),
     "backslashes": more("..\\slipped.py"),
     "a terabyte": change(hub.MODEL, size=2**40),
     "no size": change(hub.MODEL, size=None),
