@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_e2c import E2CMAPPO, GradientMultipliers, OEMRewardCallback
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.multipliers import Multipliers
-from sb3_e2c.zoo import cli, configuration, demo, enjoy, train
+from sb3_e2c.zoo import cli, configuration, demo, enjoy, resume, train
 from sb3_e2c.zoo.build import check_networks, make_worlds
 from sb3_e2c.zoo.configuration import FOLDER, merge, read_yaml, resolve
 from sb3_e2c.zoo.console import UserError, check_device, check_writable, parse_value, write_whole
@@ -111,6 +111,26 @@ def table_lines():
     lines = [line for file in FOLDER.glob("*.yml") for line in file.read_text().splitlines()]
     pattern = re.compile(r"^\s*\w+: (?:&\w+ )?(.+?)  # Table 1: (.+)$")
     return [match.groups() for match in map(pattern.match, lines) if match]
+
+
+def test_two_trainings_at_once_take_two_numbers(tmp_path, monkeypatch):
+    rehearse = train.TeamExperimentManager._rehearse
+
+    def be_late(manager, config):
+        rehearse(manager, config)
+        (tmp_path / "e2c_t" / f"{ENV}_1").mkdir(parents=True)
+
+    monkeypatch.setattr(train.TeamExperimentManager, "_rehearse", be_late)
+    run = run_train(tmp_path, steps=ROLLOUT)
+    assert run.name == f"{ENV}_2"
+    written = {path.name for path in run.iterdir()}
+    assert written >= {ENV, f"{ENV}.zip", "monitor.csv", resume.FOLDER}
+    assert not any((tmp_path / "e2c_t" / f"{ENV}_1").iterdir())
+
+
+def test_a_folder_that_looks_like_a_pattern_keeps_all_runs(tmp_path):
+    runs = [run_train(tmp_path / "logs[1]", steps=ROLLOUT) for _ in range(2)]
+    assert [run.name for run in runs] == [f"{ENV}_1", f"{ENV}_2"]
 
 
 def test_every_number_of_table_1_stands_in_exactly_one_line():

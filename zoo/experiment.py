@@ -168,9 +168,11 @@ class TeamExperimentManager(ExperimentManager):
         if self.args.resume:
             self.save_path = str(Path(self.args.resume))
             self.params_path = os.path.join(self.save_path, self.env_id)
-        run = Path(self.save_path)
-        self.points = Resumable(run, self.args.resume_every, bool(self.args.resume))
+        self.points = self._resumable()
         self.stopped_by: int | None = None  # number of the signal
+
+    def _resumable(self) -> Resumable:
+        return Resumable(Path(self.save_path), self.args.resume_every, bool(self.args.resume))
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]]:
         """Build everything; nothing is written before all of it has been built once.
@@ -199,6 +201,20 @@ class TeamExperimentManager(ExperimentManager):
         if not self.args.resume:
             self._save_config(config)
         return model, config
+
+    def create_log_folder(self) -> None:
+        """Make the run's folder; another training may have taken its number in the meantime."""
+        number = get_latest_run_id(self.log_path, self.env_name)
+        while not self.args.resume:
+            try:
+                os.makedirs(self.save_path)
+                break
+            except FileExistsError:
+                number += 1
+                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
+                self.params_path = os.path.join(self.save_path, self.env_name)
+                self.points = self._resumable()
+        super().create_log_folder()
 
     def _own_callbacks(self, config: dict[str, Any]) -> list[BaseCallback]:
         try:
