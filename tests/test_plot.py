@@ -155,6 +155,12 @@ def test_the_first_step_near_the_peak():
     assert first_step_near_peak(steps, values, 1.0) == 3.0
 
 
+def test_a_rise_begins_where_the_curve_is_lowest():
+    steps, values = np.arange(6.0), np.array([9.0, 1.0, 0.0, 2.0, 4.0, 5.0])
+    assert first_step_near_peak(steps, values, 0.4) == 3.0
+    assert first_step_near_peak(steps, values, 0.9) == 5.0
+
+
 # ---------------------------------------------------------------------------- tables
 
 

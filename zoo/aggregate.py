@@ -142,9 +142,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def first_step_near_peak(steps: np.ndarray, values: np.ndarray, share: float = 0.9) -> float:
     """The first step at which a curve has risen by ``share`` of its whole rise.
 
+    The rise begins at the lowest value: beside an adversary that learns, too, returns may fall
+    before they rise.
+
     :param steps: Shape (G,)
     :param values: Shape (G,)
-    :param share: Of the way from the first value to the highest
+    :param share: Of the way from the lowest value to the highest after it
     """
-    threshold = values[0] + share * (values.max() - values[0])
-    return float(steps[np.argmax(values >= threshold)])
+    lowest = int(np.argmin(values))
+    rise = values[lowest:]
+    threshold = rise[0] + share * (rise.max() - rise[0])
+    return float(steps[lowest + np.argmax(rise >= threshold)])
