@@ -22,7 +22,8 @@ _WALL_COLOR = "0.95 0.45 0.4 0.4"
 _NO_CONTACT = {"contype": "0", "conaffinity": "0"}
 
 # Looks only: a calm floor in squares of 1 m, light from all sides, and cameras that keep their
-# distance to the center of mass. The Ant is seen from behind, the HalfCheetah from its right.
+# distance to the center of mass. The Ant is seen from behind, the HalfCheetah from its right, with
+# the place where the bomb starts.
 _LOOKS = {
     ".//texture[@name='texplane']": {"rgb1": "0.93 0.94 0.95", "rgb2": "0.84 0.86 0.89"},
     ".//texture[@type='skybox']": {"rgb1": "0.96 0.98 1", "rgb2": "0.7 0.78 0.86"},
@@ -35,7 +36,7 @@ _LOOKS = {
 }
 _CAMERAS = {
     "Ant": {"pos": "-8 0 7", "xyaxes": "0 -1 0 0.55 0 0.835"},
-    "HalfCheetah": {"pos": "4 -10 6", "xyaxes": "1 0 0 0 0.45 0.893"},
+    "HalfCheetah": {"pos": "4.4 -9 4.6", "xyaxes": "1 0 0 0 0.42 0.907"},
 }
 
 
