@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_e2c.entropy import EntropyEstimator, NearestNeighbor, VisitCount
@@ -41,8 +42,9 @@ class OEMRewardCallback(BaseCallback):
     :param estimator: "visit_count", "nearest_neighbor", or an object with the methods of
         :class:`sb3_e2c.entropy.EntropyEstimator`
     :param estimator_kwargs: arguments of an estimator given by name
-    :param psi: weight of the bonus beside the extrinsic reward (the paper's robots: 0.3); None
-        replaces the extrinsic reward
+    :param psi: weight of the bonus beside the extrinsic reward (the paper's robots: 0.3), also as a
+        schedule of the remaining progress, which changes between rollouts; None replaces the
+        extrinsic reward
     :param verbose: 1 says at the start which bonus is given
     """
 
@@ -50,12 +52,12 @@ class OEMRewardCallback(BaseCallback):
         self,
         estimator: EntropyEstimator | str,
         estimator_kwargs: dict[str, Any] | None = None,
-        psi: float | None = None,
+        psi: float | Schedule | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose=verbose)
         self.estimator = _make_estimator(estimator, estimator_kwargs)
-        self.psi = _check_psi(psi)
+        self.psi = psi if psi is None or callable(psi) else _check_psi(psi)
         self.episode_bonuses = np.zeros(0)
         self._finished: list[float] = []
 
@@ -76,11 +78,17 @@ class OEMRewardCallback(BaseCallback):
             self.estimator.reset(len(starts))
             self.episode_bonuses = np.zeros(len(starts))
         if self.verbose > 0:
-            mode = "in place of" if self.psi is None else f"times {self.psi:g} beside"
+            psi = self._current_psi()
+            mode = "in place of" if psi is None else f"times {psi:g} beside"
             print(f"Learning from the {type(self.estimator).__name__} bonus {mode} the reward")
 
     def _on_rollout_start(self) -> None:
         self._finished = []
+
+    def _current_psi(self) -> float | None:
+        if not callable(self.psi):
+            return self.psi
+        return _check_psi(self.psi(self.model._current_progress_remaining))
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], np.asarray(self.locals["dones"], dtype=bool)
@@ -90,10 +98,11 @@ class OEMRewardCallback(BaseCallback):
         _check_bonuses(bonuses, observations, type(self.estimator).__name__)
         # A hidden channel: the algorithm goes on to learn from this very array, so it must be
         # edited in place; a new array in its locals would go unnoticed.
-        if self.psi is None:
+        psi = self._current_psi()
+        if psi is None:
             rewards[:] = bonuses
         else:
-            rewards += self.psi * bonuses
+            rewards += psi * bonuses
         self.episode_bonuses += bonuses
         self._end_episodes(dones)
         return True
@@ -101,6 +110,8 @@ class OEMRewardCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         if self._finished:
             self.logger.record("rollout/ep_oem_mean", float(np.mean(self._finished)))
+        if callable(self.psi):
+            self.logger.record("rollout/oem_psi", self._current_psi())
 
     def _end_episodes(self, dones: np.ndarray) -> None:
         if dones.any():
@@ -224,12 +235,10 @@ def _make_estimator(
     return estimator
 
 
-def _check_psi(psi: float | None) -> float | None:
-    if psi is None:
-        return None
+def _check_psi(psi: Any) -> float:
     if isinstance(psi, bool) or not isinstance(psi, Real) or not math.isfinite(psi):
         raise ValueError(
-            f"psi must be a finite number (mix the bonus with the extrinsic reward) or None "
-            f"(the bonus alone), got {psi!r}."
+            f"psi must be a finite number (mix the bonus with the extrinsic reward), a schedule of "
+            f"such numbers, or None (the bonus alone), got {psi!r}."
         )
     return float(psi)

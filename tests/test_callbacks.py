@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -113,6 +114,28 @@ def test_a_time_out_is_bootstrapped_on_top_of_the_bonus(algorithm):
 def test_psi_mixes_the_bonus_with_the_extrinsic_reward():
     rewards = learned_rewards(squares(3), nearest(psi=0.3), n_steps=3)
     assert rewards[0] == pytest.approx([10.0, 10 + 0.3 * SECOND, 10 + 0.3 * THIRD])
+
+
+def test_psi_may_fall_with_the_remaining_progress():
+    model, log = frozen_model(squares(3), n_steps=3), Log()
+    model.set_logger(Logger(None, [log]))
+    learned = []
+
+    class Keep(BaseCallback):
+        def _on_step(self) -> bool:
+            learned.append(float(self.locals["rewards"][0]))
+            return True
+
+    model.learn(6, [nearest(psi=lambda remaining: 0.3 * remaining), Keep()], log_interval=1)
+    first = [10.0, 10 + 0.3 * SECOND, 10 + 0.3 * THIRD]
+    second = [10.0, 10 + 0.15 * SECOND, 10 + 0.15 * THIRD]
+    assert learned == pytest.approx([*first, *second])
+    assert log.column("rollout/oem_psi") == pytest.approx([0.3, 0.15])
+
+
+def test_a_schedule_without_a_number_stops_the_run():
+    with pytest.raises(ValueError, match="got nan"):
+        frozen_model(squares(3), n_steps=3).learn(3, nearest(psi=lambda _: math.nan))
 
 
 def test_beta_weighs_the_bonus_and_counts_as_1_if_it_is_missing_none_or_0():
