@@ -58,6 +58,8 @@ class GradientMultipliers(Multipliers):
     :param agent_scaling: Multiply the step by K. An individual violation is about N times smaller
         than the team's, so that the multipliers of both kinds of constraints move alike; False
         takes the paper's literal step (docs/paper.md, D8)
+    :param pooled: Move all parties' multipliers alike, by their mean violation. Individual
+        constraints then limit the team as a whole, while every agent answers for its own cost
     """
 
     def __init__(
@@ -67,16 +69,19 @@ class GradientMultipliers(Multipliers):
         initial: float = 0.0,
         maximum: float = math.inf,
         agent_scaling: bool = True,
+        pooled: bool = False,
     ):
         super().__init__(shape)
-        _check_form(shape, agent_scaling)
+        _check_form(shape, agent_scaling=agent_scaling, pooled=pooled)
         _check(learning_rate=learning_rate, initial=initial, maximum=maximum)
         self.learning_rate = learning_rate * (shape[0] if agent_scaling else 1)
         self.maximum = maximum
+        self.pooled = pooled
         self.register_buffer("values", th.full(shape, float(initial)))
 
     def update(self, violation: th.Tensor) -> None:
         """See :meth:`Multipliers.update`."""
+        violation = _pool(violation) if self.pooled else violation
         self.values.add_(_times(self.learning_rate, violation)).clamp_(0.0, self.maximum)
 
 
@@ -95,6 +100,7 @@ class PIDMultipliers(Multipliers):
     :param initial: I, and λ, at the start
     :param maximum: λ_max, also the limit of the integral
     :param agent_scaling: See :class:`GradientMultipliers`; scales all three gains
+    :param pooled: See :class:`GradientMultipliers`
     """
 
     integral: th.Tensor
@@ -109,19 +115,22 @@ class PIDMultipliers(Multipliers):
         initial: float = 0.0,
         maximum: float = math.inf,
         agent_scaling: bool = True,
+        pooled: bool = False,
     ):
         super().__init__(shape)
-        _check_form(shape, agent_scaling)
+        _check_form(shape, agent_scaling=agent_scaling, pooled=pooled)
         _check(kp=kp, ki=ki, kd=kd, initial=initial, maximum=maximum)
         scale = shape[0] if agent_scaling else 1
         self.kp, self.ki, self.kd = scale * kp, scale * ki, scale * kd
         self.maximum = maximum
+        self.pooled = pooled
         self.register_buffer("values", th.full(shape, float(initial)))
         self.register_buffer("integral", self.values.clone())
         self.register_buffer("previous", th.full(shape, math.inf))  # no increase at first
 
     def update(self, violation: th.Tensor) -> None:
         """See :meth:`Multipliers.update`."""
+        violation = _pool(violation) if self.pooled else violation
         increase = (violation - self.previous).nan_to_num(0.0).clamp_(min=0.0)
         self.previous.copy_(violation)
         self.integral.add_(_times(self.ki, violation)).clamp_(0.0, self.maximum)
@@ -129,17 +138,23 @@ class PIDMultipliers(Multipliers):
         self.values.copy_(values.clamp_(0.0, self.maximum))
 
 
+def _pool(violation: th.Tensor) -> th.Tensor:
+    """The mean over the parties, for each of them; shape (K, M)."""
+    return violation.mean(dim=0, keepdim=True).expand_as(violation)
+
+
 def _times(gain: float, violation: th.Tensor) -> th.Tensor:
     """Their product; a gain of 0 ignores also a violation of −∞, which an infinite limit gives."""
     return gain * violation if gain > 0 else th.zeros_like(violation)
 
 
-def _check_form(shape: Any, agent_scaling: Any) -> None:
+def _check_form(shape: Any, **flags: Any) -> None:
     sizes = shape if isinstance(shape, (tuple, list, th.Size)) else ()
     if len(sizes) != 2 or not all(isinstance(size, int) and size >= 0 for size in sizes):
         raise TypeError(f"multipliers: shape is {shape!r}; expected two whole numbers (K, M)")
-    if not isinstance(agent_scaling, bool):
-        raise TypeError(f"multipliers: agent_scaling is {agent_scaling!r}; expected True or False")
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise TypeError(f"multipliers: {name} is {value!r}; expected True or False")
 
 
 def _check(initial: float, maximum: float, **gains: float) -> None:

@@ -188,6 +188,7 @@ def test_an_object_that_cannot_be_shown_is_named_by_its_type():
     [
         *({"shape": odd} for odd in ("a", 1, None, (1,), (1, -1), (1.0, 1), [[1, 1]])),
         *({"agent_scaling": odd} for odd in (None, 1, "a", 0.0)),
+        *({"pooled": odd} for odd in (None, 1, "a", 0.0)),
         *({"initial": odd} for odd in (None, "a", -1, NAN, INF, True, 10**400, [0.0])),
         *({"maximum": odd} for odd in (None, "a", -1, NAN, True, 1e300)),
     ],

@@ -43,6 +43,16 @@ def test_agents_and_constraints_have_multipliers_of_their_own():
     assert multipliers.values.tolist() == [[1.0, 0.0], [0.0, 2.0]]
 
 
+@pytest.mark.parametrize("cls", [GradientMultipliers, PIDMultipliers])
+def test_pooled_multipliers_follow_the_team_as_one_multiplier_of_the_team_does(cls):
+    pooled, team = cls((3, 1), pooled=True), cls((1, 1))
+    for violations in ([9.0, -3.0, 0.0], [0.0, 15.0, -3.0], [-6.0, -3.0, 8.0]):
+        pooled.update(th.tensor(violations)[:, None])
+        team.update(th.tensor([[sum(violations)]]))
+        assert pooled.values.flatten().tolist() == pytest.approx([team.values.item()] * 3)
+    assert team.values.item() > 0
+
+
 def test_pid_with_only_an_integral_is_gradient_ascent():
     violations = [20, -10, -30, 5]
     pid = PIDMultipliers((1, 1), kp=0, ki=0.05, kd=0)

@@ -434,7 +434,9 @@ SENSIBLE = {
     "cost_scope": st.sampled_from(["team", "individual"]),
     "multipliers_class": st.sampled_from([GradientMultipliers, PIDMultipliers]),
     "multipliers_kwargs": st.dictionaries(
-        st.sampled_from(["learning_rate", "initial", "maximum", "kp", "agent_scaling", "shape"]),
+        st.sampled_from(
+            ["learning_rate", "initial", "maximum", "kp", "agent_scaling", "pooled", "shape"]
+        ),
         numbers,
         max_size=2,
     ),
@@ -557,8 +559,8 @@ PARTS = [
     (VisitCount, ["quantization", "empty", "high"]),
     (NearestNeighbor, ["k"]),
     (OEMRewardCallback, ["estimator", "estimator_kwargs", "psi", "verbose"]),
-    (GradientMultipliers, ["learning_rate", "initial", "maximum", "agent_scaling"]),
-    (PIDMultipliers, ["kp", "ki", "kd", "initial", "maximum", "agent_scaling"]),
+    (GradientMultipliers, ["learning_rate", "initial", "maximum", "agent_scaling", "pooled"]),
+    (PIDMultipliers, ["kp", "ki", "kd", "initial", "maximum", "agent_scaling", "pooled"]),
 ]
 parts = st.one_of(
     [
