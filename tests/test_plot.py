@@ -300,6 +300,13 @@ def test_the_report_of_a_suite_that_has_only_begun(tmp_path, capsys):
     assert (report.parent / "fig3_curves.png").is_file()
 
 
+def test_results_are_drawn_although_their_preset_has_gone(folder):
+    path = folder / "suite.yml"
+    path.write_text(SUITE.replace("  mappo: {", "  mappo: {preset: gone, "))
+    assert "gone" in path.read_text()
+    cli.main(["plot", "-f", str(folder.parent.parent)])
+
+
 def test_the_same_results_give_the_same_picture(folder):
     suite, results = read_suite(folder / "suite.yml"), find_results(folder)
     groups = {(ENV, "mappo"): [r for r in results if r.label == "mappo"]}

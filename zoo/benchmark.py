@@ -36,7 +36,7 @@ from sb3_e2c.zoo.console import (
 from sb3_e2c.zoo.jobs import BUSY, Outcome
 from sb3_e2c.zoo.pools import LocalPool, Pool, RayPool
 from sb3_e2c.zoo.results import Place, read_json
-from sb3_e2c.zoo.suite import Job, find_suite, read_suite, suite_names, suite_text
+from sb3_e2c.zoo.suite import Job, check_methods, find_suite, read_suite, suite_names, suite_text
 
 _LOOK_EVERY = 1.0  # seconds
 _PRINT_EVERY = 60.0  # seconds between lines where lines cannot be overwritten
@@ -340,6 +340,7 @@ def benchmark(args: argparse.Namespace) -> list[Outcome]:
     _check(args)
     path = find_suite(args.suite)
     suite = read_suite(path)
+    check_methods(path, suite)
     chosen = suite.jobs(parse_seeds(args.seeds), args.only)
     lengths, refused = plan([Place(args.folder, job) for job in chosen])
     if args.dry_run:

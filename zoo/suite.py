@@ -204,7 +204,8 @@ def read_suite(path: Path, name: str | None = None) -> Suite:
 
     :param path: The file
     :param name: What it is called; default: as the file
-    :raises UserError: for anything in it that cannot be meant; environments are not looked up
+    :raises UserError: for anything in it that cannot be meant; algorithms, presets and environments
+        are not looked up
     """
     name = path.stem if name is None else name
     _check_name(path, "name of the file", name)
@@ -263,13 +264,22 @@ def _read_method(path: Path, label: str, entry: Any, preset: str) -> Method:
     _check_keys(path, f"{where}.", entry, _METHOD)
     presets = ",".join([preset, *([entry["preset"]] if "preset" in entry else [])])
     names = {"label": label, "name": label, "algo": label}
-    method = Method(**{**names, **entry, "preset": presets})
-    try:
-        check_algo(method.algo)
-        parse_presets(method.preset)
-    except UserError as error:
-        raise UserError(f"{path}: {where}: {error}") from None
-    return method
+    return Method(**{**names, **entry, "preset": presets})
+
+
+def check_methods(path: Path, suite: Suite) -> None:
+    """Refuse algorithms and presets that do not exist; old results are drawn without them.
+
+    :param path: The suite's file
+    :param suite: What :func:`read_suite` has read there
+    :raises UserError: for the first that is unknown
+    """
+    for label, method in suite.methods.items():
+        try:
+            check_algo(method.algo)
+            parse_presets(method.preset)
+        except UserError as error:
+            raise UserError(f"{path}: methods.{label}: {error}") from None
 
 
 def _read_experiment(
