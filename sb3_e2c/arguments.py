@@ -121,6 +121,7 @@ KEYWORDS = Rule("a dict of arguments by their names, or None", _mapping)
 ATTRIBUTES: dict[str, Rule] = {
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs"), COUNT),
     **dict.fromkeys(("gamma", "gae_lambda"), SHARE),
+    "cost_margin": _number("a number from 0, and less than 1", lambda number: 0 <= number < 1),
     "cost_gamma": _or_none(SHARE),
     "learning_rate": _or_schedule(FINITE, FINITE),
     "critic_learning_rate": _or_none(_or_schedule(FINITE, FINITE)),

@@ -84,6 +84,8 @@ class MAPPO(PPO):
     :param cost_scope: "team": one multiplier and a joint cost critic for each limit; "individual":
         every agent has its own, on local observations, with the limit divided by N (Sec. 4.1)
     :param cost_gamma: Discount of the costs; None: ``gamma``
+    :param cost_margin: Share of every limit that the multipliers keep in reserve: they aim at
+        (1 − cost_margin) l, because what is learned last is often a little above the limit
     :param multipliers_class: ``GradientMultipliers`` or ``PIDMultipliers``
     :param multipliers_kwargs: Its arguments, except the shape
     :param reward_scale: Factor on the environment's reward for learning; never on what is reported
@@ -140,6 +142,7 @@ class MAPPO(PPO):
         cost_limits: float | Sequence[float] | None = None,
         cost_scope: CostScope = "team",
         cost_gamma: float | None = None,
+        cost_margin: float = 0.0,
         multipliers_class: type[Multipliers] = GradientMultipliers,
         multipliers_kwargs: dict[str, Any] | None = None,
         reward_scale: float = 1.0,
@@ -159,6 +162,7 @@ class MAPPO(PPO):
         self.cost_limits = parse_cost_limits(cost_limits)
         self.cost_scope = cost_scope
         self.cost_gamma = cost_gamma
+        self.cost_margin = cost_margin
         self.multipliers_class = multipliers_class
         self.multipliers_kwargs = {} if multipliers_kwargs is None else multipliers_kwargs
         self.reward_scale = reward_scale
@@ -244,7 +248,7 @@ class MAPPO(PPO):
         self.policy_kwargs = user_kwargs
         shape = (parties, len(self.cost_limits))
         self.multipliers = self.multipliers_class(shape, **self.multipliers_kwargs).to(self.device)
-        self._party_limits = party_limits(self.cost_limits, parties)
+        self._aims = party_limits((1 - self.cost_margin) * self.cost_limits, parties)
         self._attach_opponent()
 
     def _attach_opponent(self) -> None:
@@ -608,7 +612,7 @@ class MAPPO(PPO):
         assert self._recorder is not None, "learn() makes the recorder"
         finished_costs = self._recorder.finished_costs
         if finished_costs and len(self.cost_limits):
-            excess = violation(np.array(finished_costs), self._party_limits)
+            excess = violation(np.array(finished_costs), self._aims)
             self.multipliers.update(th.as_tensor(excess, dtype=th.float32, device=self.device))
             if not th.isfinite(self.multipliers.values).all():
                 raise ValueError(

@@ -32,6 +32,7 @@ def without_none(values):
 ODD = {
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size"), NO_COUNT),
     **dict.fromkeys(("gamma", "gae_lambda"), NO_SHARE),
+    "cost_margin": [1.0, *NO_SHARE],
     "cost_gamma": without_none(NO_SHARE),
     "learning_rate": NO_RATE,
     "critic_learning_rate": without_none(NO_RATE),
@@ -100,6 +101,7 @@ def test_numpy_s_numbers_do_the_same_as_python_s():
     numbers |= {"learning_rate": 0.125, "gamma": 0.5, "gae_lambda": 0.75, "clip_range": 0.25}
     numbers |= {"clip_range_vf": 0.5, "ent_coef": 0.125, "vf_coef": 0.25, "max_grad_norm": 1.0}
     numbers |= {"target_kl": 8.0, "reward_scale": 2.0, "critic_learning_rate": 0.25, "verbose": 0}
+    numbers |= {"cost_margin": 0.25}
     numbers |= {"cost_gamma": 0.25, "normalize_values": True, "normalize_advantage": False}
     types = {int: np.int64, float: np.float32, bool: np.bool_}  # all are whole binary fractions
     plain = make(n_updates=2, **numbers)

@@ -215,6 +215,12 @@ class TestConstraints:
         model = all_fast(make(cost_limits=3.0)).learn(32)
         assert model.multipliers.values.item() == pytest.approx(0.05 * 5)
 
+    def test_a_margin_lowers_what_the_multipliers_aim_at(self):
+        # (1 - 0.25) 4 = 3, as above; without a margin the violation would be 4
+        model = all_fast(make(cost_limits=4.0, cost_margin=0.25)).learn(32)
+        assert model.multipliers.values.item() == pytest.approx(0.05 * 5)
+        assert model.cost_limits.tolist() == [4.0]
+
     def test_individual_limits_are_the_teams_divided_by_n(self):
         # agent_0 costs 2 a step: J = (8, 4), limit 6 / 2 = 3; steps are multiplied by N = 2
         env = line(agent_costs=(2.0, 1.0))

@@ -45,7 +45,7 @@ _COUNT, _SHARE, _AMOUNT = (1, sys.maxsize), (0, 1), (0, math.inf)
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("n_envs", "n_timesteps", "n_steps", "batch_size", "n_epochs"), _COUNT),
     **dict.fromkeys(("stats_window_size", "net_arch", "gru_hidden_size"), _COUNT),
-    **dict.fromkeys(("gamma", "gae_lambda", "cost_gamma"), _SHARE),
+    **dict.fromkeys(("gamma", "gae_lambda", "cost_gamma", "cost_margin"), _SHARE),
     **dict.fromkeys(("learning_rate", "critic_learning_rate", "clip_range"), _AMOUNT),
     **dict.fromkeys(("clip_range_vf", "clip_obs", "clip_reward", "epsilon"), _AMOUNT),
     **dict.fromkeys(("ent_coef", "vf_coef", "max_grad_norm", "target_kl"), _AMOUNT),

@@ -257,7 +257,7 @@ _KEYS = {"low", "high", "scale"}
 def _is_read(algo: str, config: Mapping[str, Any], key: str) -> bool:
     """Whether a value under this key would change anything."""
     part, oem = key.split(".")[0], config.get("oem_kwargs")
-    of_limits = part.startswith("multipliers_") or part == "cost_gamma"
+    of_limits = part.startswith("multipliers_") or part in ("cost_gamma", "cost_margin")
     if of_limits and config.get("cost_limits") in (None, []):
         return False
     if part == "reward_scale" and oem and oem.get("psi") is None:  # the bonus replaces the reward
