@@ -85,11 +85,6 @@ class OEMRewardCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self._finished = []
 
-    def _current_psi(self) -> float | None:
-        if not callable(self.psi):
-            return self.psi
-        return _check_psi(self.psi(self.model._current_progress_remaining))
-
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], np.asarray(self.locals["dones"], dtype=bool)
         rewards = _editable_rewards(self.locals)
@@ -112,6 +107,11 @@ class OEMRewardCallback(BaseCallback):
             self.logger.record("rollout/ep_oem_mean", float(np.mean(self._finished)))
         if callable(self.psi):
             self.logger.record("rollout/oem_psi", self._current_psi())
+
+    def _current_psi(self) -> float | None:
+        if not callable(self.psi):
+            return self.psi
+        return _check_psi(self.psi(self.model._current_progress_remaining))
 
     def _end_episodes(self, dones: np.ndarray) -> None:
         if dones.any():
