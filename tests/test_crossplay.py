@@ -93,6 +93,19 @@ def test_more_episodes_or_a_new_training_are_played_anew(played, monkeypatch):
     crossplay.main(flags)
 
 
+def test_another_pool_is_added(played):
+    _, flags, path = played
+    rows = path.read_text().splitlines()
+    crossplay.main([*flags, "--pool", "c_mappo"])
+    both = pd.read_csv(path)
+    assert set(rows) < set(path.read_text().splitlines())
+    met = both[(both["label"] == "c_mappo") & (both["seed"] == 0)]["opponent"]
+    assert set(met) == {"own", "random", "mappo/seed_0", "mappo/seed_1", "c_mappo/seed_1"}
+    crossplay.main(flags)  # keeps it
+    pd.testing.assert_frame_equal(pd.read_csv(path), both)
+    path.write_text("\n".join(rows) + "\n")
+
+
 def test_a_table_that_does_not_say_which_runs_met_is_played_anew(played):
     _, flags, path = played
     rows = path.read_text()
@@ -103,17 +116,18 @@ def test_a_table_that_does_not_say_which_runs_met_is_played_anew(played):
 
 def test_the_report_shows_it(played):
     report = plot.plot_suite(played[2].parent, played[0] / "plots")
-    assert "adversaries of other runs (pool)" in report.read_text()
+    assert "adversaries of other runs" in report.read_text()
 
 
 def test_the_pool_counts_as_one_opponent_of_each_seed(played):
     suite = read_suite(played[0] / "tiny.yml")
-    rows = [(0, "own", 9), (0, "a", 1), (0, "b", 3), (1, "own", 9), (1, "a", 5), (1, "b", 7)]
+    pool = [(0, "e2c/seed_0", 1), (0, "e2c/seed_1", 3), (1, "e2c/seed_0", 5), (1, "e2c/seed_1", 7)]
+    rows = [*pool, (0, "own", 9), (1, "own", 9)]
     table = pd.DataFrame(rows, columns=["seed", "opponent", "return"])
     table = table.assign(env=ENV, label="mappo")
     (row,) = readable_crossplay(suite.experiments[0], table, suite).to_dict("records")
     assert row["return, own"] == "9.0 ± 0.0"
-    assert row["return, pool"] == "4.0 ± 2.0"  # seeds 2 and 6
+    assert row["return, e2c"] == "4.0 ± 2.0"  # seeds 2 and 6
 
 
 @pytest.mark.parametrize(

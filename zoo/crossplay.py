@@ -2,7 +2,8 @@
 
 Return against an adversary that learned together with the team says little about the team. Here
 all teams of a task meet the same opponents: random actions, and the adversaries of some method's
-runs (without that of the team's own run). Call it again to go on, or when new runs have finished.
+runs (without that of the team's own run). Call it again to go on, when new runs have finished, or
+with another pool, which is added to the table.
 """
 
 import argparse
@@ -115,11 +116,11 @@ def _is_of(table: pd.DataFrame, place: Place) -> "pd.Series[bool]":
 
 
 def _up_to_date(
-    table: pd.DataFrame, place: Place, against: dict[str, Opponent], n_episodes: int
+    table: pd.DataFrame, place: Place, known: dict[str, Opponent], n_episodes: int
 ) -> pd.DataFrame:
     """A team's rows that need not be played again: as many episodes, of the same two runs."""
     rows = table[_is_of(table, place)]
-    trained = [getattr(against.get(name), "trained", None) for name in rows["opponent"]]
+    trained = [getattr(known.get(name), "trained", None) for name in rows["opponent"]]
     good = (rows["episodes"] == n_episodes) & (rows["trained"] == _finished(place))
     return rows[good & (rows["opponent_trained"] == pd.Series(trained, rows.index, dtype=object))]
 
@@ -152,7 +153,7 @@ def crossplay(args: argparse.Namespace) -> Path:
         table = table.reindex(columns=[*_WHICH, *numbers], fill_value="")
     for place in tqdm(found):
         against = opponents(place, pool)
-        kept = _up_to_date(table, place, against, args.n_episodes)
+        kept = _up_to_date(table, place, opponents(place, found), args.n_episodes)
         missing = {
             name: each for name, each in against.items() if name not in set(kept["opponent"])
         }

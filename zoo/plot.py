@@ -194,7 +194,7 @@ def _tables(
     if data.crossplay is not None:
         table = readable_crossplay(experiment, data.crossplay, data.suite)
         if not table.empty:
-            title = "Own adversary, random actions, and adversaries of other runs (pool)"
+            title = "Against the own adversary, random actions, and adversaries of other runs"
             tables.append((title, table))
     return tables
 

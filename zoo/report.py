@@ -211,9 +211,9 @@ def _crossplay_row(rows: pd.DataFrame, suite: Suite) -> dict[str, str]:
     first = rows.iloc[0]
     cells = {"task": str(first["env"]), "method": suite.methods[str(first["label"])].name}
     cells["seeds"] = str(rows["seed"].nunique())
-    kinds = rows["opponent"].where(rows["opponent"].isin(["own", "random"]), "pool")
-    seeds = rows.groupby([kinds, "seed"])[measures(rows)].mean()  # all of the pool together
-    for kind in [kind for kind in ("own", "random", "pool") if kind in seeds.index]:
+    kinds = rows["opponent"].str.split("/").str[0]  # of a pool, all seeds together
+    seeds = rows.groupby([kinds, "seed"])[measures(rows)].mean()
+    for kind in sorted(set(kinds), key=lambda kind: (kind not in ("own", "random"), kind)):
         for name in measures(rows):
             values = seeds.loc[kind, name].to_numpy(float)
             error = float(mean_and_error(values)[1]) if len(values) > 1 else np.nan
