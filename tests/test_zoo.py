@@ -525,6 +525,14 @@ def test_networks_that_a_file_cannot_hold_are_refused(tmp_path, kwargs):
         check_networks({"policy_kwargs": kwargs}, tmp_path / "model.zip")
 
 
+def test_networks_of_opponents_that_a_file_cannot_hold_are_refused(tmp_path):
+    for name in ("model.zip", "model.adversary.zip"):
+        (tmp_path / name).write_bytes(bytes(1000))
+    large = {"policy_kwargs": {"net_arch": [60_000]}}
+    with pytest.raises(UserError, match=r"adversary\.zip has 1,000 bytes, but the networks"):
+        check_networks({"opponent_kwargs": large}, tmp_path / "model.zip")
+
+
 def test_continuing_refuses_another_method(copy, capsys):
     start = run_folder(copy) / f"{ENV}.zip"
     argv = ["--algo", "e2c", "--env", ENV, "-f", copy, "-i", start]

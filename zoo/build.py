@@ -137,20 +137,27 @@ def check_networks(config: Mapping[str, Any], path: str | Path) -> None:
     :param path: The model's zip file
     :raises UserError: if they are larger
     """
-    kwargs = config.get("policy_kwargs") or {}
-    layers = kwargs.get("net_arch") or []
+    team = config.get("policy_kwargs") or {}
+    others = (config.get("opponent_kwargs") or {}).get("policy_kwargs", team) or {}
+    for kwargs, file in ((team, path), (others, adversary_path(path))):
+        least = _fewest_weights(kwargs)
+        found = os.path.getsize(file) if os.path.exists(file) else math.inf
+        if 0 < found < least:  # a weight has four bytes, and hardly compresses
+            raise UserError(
+                f"{file} has {found:,} bytes, but the networks in config.yml {least:,} weights; "
+                "does it belong to this run?"
+            )
+
+
+def _fewest_weights(policy_kwargs: Mapping[str, Any]) -> int:
+    """Networks of these sizes have at least as many."""
+    layers = policy_kwargs.get("net_arch") or []
     chains = list(layers.values()) if isinstance(layers, Mapping) else [layers]
-    least = 3 * kwargs.get("gru_hidden_size", 0) ** 2
+    least = 3 * policy_kwargs.get("gru_hidden_size", 0) ** 2
     least += sum(a * b for chain in chains for a, b in itertools.pairwise(chain))
     least += sum(sum(chain) for chain in chains)  # biases
-    extractor = numbers_in(kwargs.get("features_extractor_kwargs"))
-    least += sum(width for width in extractor if width > 0)  # each may be a layer's
-    found = os.path.getsize(path) if os.path.exists(path) else math.inf
-    if 0 < found < least:  # a weight has four bytes, and hardly compresses
-        raise UserError(
-            f"{path} has {found:,} bytes, but the networks in config.yml {least:,} weights; does "
-            "it belong to this run?"
-        )
+    extractor = numbers_in(policy_kwargs.get("features_extractor_kwargs"))
+    return least + sum(width for width in extractor if width > 0)  # each may be a layer's
 
 
 def load_weights(model: MAPPO, path: str | Path) -> None:
