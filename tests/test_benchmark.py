@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -256,6 +258,24 @@ def test_settings_become_flags_of_train(place):
     assert "n_envs:2" in params
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_a_result_names_the_commit_of_a_checkout(tmp_path):
+    def git(*words):
+        who = ("-c", "user.name=me", "-c", "user.email=me@example.org")
+        subprocess.run(["git", "-C", str(tmp_path), *who, *words], check=True, capture_output=True)
+
+    assert jobs._commit(tmp_path) is None
+    git("init")
+    assert jobs._commit(tmp_path) is None  # nothing committed
+    (tmp_path / "file").write_text("1")
+    git("add", "file")
+    git("commit", "-m", "first")
+    commit = jobs._commit(tmp_path)
+    assert re.fullmatch("[0-9a-f]{12}", commit)
+    (tmp_path / "file").write_text("2")
+    assert jobs._commit(tmp_path) == f"{commit}-dirty"
+
+
 def test_a_job_leaves_small_files_and_is_not_repeated(place, monkeypatch):
     assert jobs.run_job(place) == 0
     curve = pd.read_csv(place.results / "curve.csv")
@@ -267,6 +287,7 @@ def test_a_job_leaves_small_files_and_is_not_repeated(place, monkeypatch):
     assert [evaluation[mode]["deterministic"] for mode in jobs.MODES] == [False, True]
     record = read_json(place.done)
     assert record["config"]["n_timesteps"] == record["agent_steps"] == 2 * ROLLOUT
+    assert "commit" in record
     assert str(place.folder) not in place.done.read_text()
     (result,) = find_results(place.folder / "results" / "tiny")
     assert (result.env, result.label, result.seed) == (ENV, "small", 0)

@@ -176,6 +176,7 @@ def _record(place: Place, config: dict[str, Any], evaluation_seconds: float) -> 
         "finished": _now(),
         "machine": {"cores": os.cpu_count(), "cpu": _cpu(), "system": platform.system()},
         "versions": {"python": platform.python_version()} | dict(_versions()),
+        "commit": _commit(Path(__file__).resolve().parents[1]),
         "config": config,
     }
 
@@ -193,6 +194,16 @@ def _versions() -> Iterator[tuple[str, str]]:
     for package in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             yield package, metadata.version(package)
+
+
+def _commit(root: Path) -> str | None:
+    """Of a checkout; None if the folder is none, as that of an installed wheel."""
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--dirty"]
+    with suppress(OSError, subprocess.CalledProcessError):  # no git, or not ours
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).strip()
+    return None
 
 
 def _cpu() -> str:
