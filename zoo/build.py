@@ -131,10 +131,10 @@ def build_model(algo: str, config: Mapping[str, Any], env: VecEnv, **flags: Any)
 
 
 def check_networks(config: Mapping[str, Any], path: str | Path) -> None:
-    """Refuse a configuration whose networks the file cannot hold, before they take any memory.
+    """Refuse a configuration whose networks the files cannot hold, before they take any memory.
 
     :param config: See :func:`sb3_e2c.zoo.configuration.resolve`
-    :param path: The model's zip file
+    :param path: The model's zip file; an adversary's may lie beside it
     :raises UserError: if they are larger
     """
     team = config.get("policy_kwargs") or {}

@@ -100,6 +100,7 @@ def run_job(place: Place) -> int:
 def _train_and_evaluate(place: Place) -> int:
     config = place.job.configuration()
     limits = team_limits(place.job.env, config)
+    commit = _commit(Path(__file__).resolve().parents[1])  # before anybody changes the checkout
     _forget_other_settings(place)
     if not _trained(place, config):
         try:
@@ -113,7 +114,7 @@ def _train_and_evaluate(place: Place) -> int:
     started = time.time()
     write_json(place.results / "evaluation.json", {mode: _evaluate(place, mode) for mode in MODES})
     place.failure.unlink(missing_ok=True)
-    write_json(place.done, _record(place, config, evaluation_seconds=time.time() - started))
+    write_json(place.done, _record(place, config, commit, time.time() - started))
     return 0
 
 
@@ -164,7 +165,9 @@ def _evaluate(place: Place, mode: str) -> dict[str, Any]:
     return result
 
 
-def _record(place: Place, config: dict[str, Any], evaluation_seconds: float) -> dict[str, Any]:
+def _record(
+    place: Place, config: dict[str, Any], commit: str | None, evaluation_seconds: float
+) -> dict[str, Any]:
     """How a result came about."""
     flags = [word.replace(str(place.log_folder), "logs") for word in train_flags(place)]
     return {
@@ -176,7 +179,7 @@ def _record(place: Place, config: dict[str, Any], evaluation_seconds: float) -> 
         "finished": _now(),
         "machine": {"cores": os.cpu_count(), "cpu": _cpu(), "system": platform.system()},
         "versions": {"python": platform.python_version()} | dict(_versions()),
-        "commit": _commit(Path(__file__).resolve().parents[1]),
+        "commit": commit,
         "config": config,
     }
 
