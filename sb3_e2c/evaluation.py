@@ -273,7 +273,9 @@ class TeamEvalCallback(EvalCallback):
                     "wrap both in VecNormalize, in the same place"
                 ) from error
         self._is_success_buffer = []
-        with th.random.fork_rng():  # sampling here leaves the random numbers of the training alone
+        device = self.model.device
+        gpus = [device] if device.type == "cuda" else []
+        with th.random.fork_rng(gpus):  # the random numbers of the training stay as they are
             return evaluate_team(
                 self.model,
                 self.eval_env,

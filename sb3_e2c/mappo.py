@@ -52,7 +52,7 @@ from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory
-from sb3_e2c.teams import check_batch, check_subclass, check_team, monitored, team_of
+from sb3_e2c.teams import check_actions, check_batch, check_subclass, check_team, monitored, team_of
 from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
@@ -78,7 +78,7 @@ class MAPPO(PPO):
     :param learning_rate: Of the actor, and of the critics unless they have their own
     :param n_steps: Steps of each world in a rollout; a multiple of the episode length is best
     :param batch_size: Largest minibatch in agent steps; whole team steps are drawn, and minibatches
-        of a rollout have nearly equal sizes
+        of a rollout have nearly equal sizes. With GRUs whole sequences are, and it is approximate
     :param cost_limits: Limit(s) on the team's undiscounted cost of an episode, one for each cost
         that the environment reports in ``info["cost"]``; None or [] is plain MAPPO
     :param cost_scope: "team": one multiplier and a joint cost critic for each limit; "individual":
@@ -295,6 +295,7 @@ class MAPPO(PPO):
     def _check_setup(self) -> None:
         settle(self)
         check_batch(self.n_agents, self.batch_size)
+        check_actions(self.action_space)
         check_subclass("policy_class", self.policy_class, TeamPolicy)
         check_subclass("multipliers_class", self.multipliers_class, Multipliers)
         if self.env is not None:

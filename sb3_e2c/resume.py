@@ -296,7 +296,7 @@ def _set_state(part: Any, values: State, away: float) -> None:
 
 
 def _random_state(device: th.device) -> tuple[Any, ...]:
-    on_gpu = th.cuda.get_rng_state_all() if device.type == "cuda" else None
+    on_gpu = th.cuda.get_rng_state(device) if device.type == "cuda" else None
     return random.getstate(), np.random.get_state(), th.get_rng_state(), on_gpu
 
 
@@ -306,4 +306,4 @@ def _set_random_state(state: tuple[Any, ...], device: th.device) -> None:
     np.random.set_state(of_numpy)
     th.set_rng_state(of_torch)
     if on_gpu is not None and device.type == "cuda":
-        th.cuda.set_rng_state_all(on_gpu)
+        th.cuda.set_rng_state(on_gpu, device)

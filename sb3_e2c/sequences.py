@@ -84,19 +84,24 @@ def initial_memory(cut: Cut, at_rollout_start: Memory) -> Memory:
 
 
 def random_groups(cut: Cut, n_team_steps: int) -> Iterator[Cut]:
-    """Divide sequences at random into groups of about equal numbers of sequences.
+    """Divide sequences at random into groups of about equal numbers of team steps.
 
     :param cut: All sequences
-    :param n_team_steps: About the largest number of team steps in a group
+    :param n_team_steps: About the largest number of team steps in a group; sequences stay whole
     :return: Groups that together hold every sequence once
     """
-    n_groups = min(-(-int(cut.lengths.sum()) // n_team_steps), len(cut.worlds))
+    n_steps = int(cut.lengths.sum())
+    n_groups = min(-(-n_steps // n_team_steps), len(cut.worlds))
     if n_groups == 1:
         yield cut
         return
-    for chosen in np.array_split(np.random.permutation(len(cut.worlds)), n_groups):
-        chosen.sort()  # keeps the longest first
-        yield Cut(*(field[chosen] for field in cut))
+    order = np.random.permutation(len(cut.worlds))
+    lengths = cut.lengths[order]
+    middles = np.cumsum(lengths) - lengths / 2
+    groups = (middles * n_groups / n_steps).astype(int)
+    for chosen in (np.sort(order[groups == g]) for g in range(n_groups)):  # the longest first
+        if len(chosen):
+            yield Cut(*(field[chosen] for field in cut))
 
 
 def alternate(sequences: Sequences) -> list[tuple[th.Tensor, Sequences]]:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
@@ -62,6 +64,18 @@ def check_batch(n_agents: int, batch_size: int) -> None:
         raise ValueError(
             f"batch_size is {batch_size}, smaller than the team of {n_agents} agents; a minibatch "
             "holds whole team steps, so raise batch_size"
+        )
+
+
+def check_actions(space: spaces.Space) -> None:
+    """Refuse numbered actions that do not begin at 0, as those of the networks do.
+
+    :param space: The actions of an agent
+    """
+    if np.any(getattr(space, "start", 0)):
+        raise ValueError(
+            f"the action space is {space}; expected actions that are numbered from 0 on, as "
+            "Stable-Baselines3 does. Shift them in a PettingZoo wrapper's step"
         )
 
 

@@ -492,9 +492,9 @@ def agent_kls(distribution: Distribution, old: ActorOutputs, new: ActorOutputs) 
     shape = tuple(new.log_prob.shape)
     if old.raw is None or new.raw is None:
         return bounds.sampled_kl((new.log_prob - old.log_prob).double().numpy())
-    before, after = (each.double().cpu() for each in (old.raw, new.raw))
+    before, after = (each.cpu().double() for each in (old.raw, new.raw))
     if isinstance(distribution, DiagGaussianDistribution):
-        stds = (each.log_std.double().cpu().numpy() for each in (old, new))  # type: ignore[union-attr]
+        stds = (each.log_std.cpu().double().numpy() for each in (old, new))  # type: ignore[union-attr]
         old_std, new_std = stds
         return bounds.gaussian_kl(before.numpy(), old_std, after.numpy(), new_std).reshape(shape)
     sizes = [before.shape[-1]]

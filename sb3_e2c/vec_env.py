@@ -71,7 +71,8 @@ def share_parameters(
     :param make_env: returns a new environment at every call
     :param n_worlds: number of worlds W
     :param n_processes: worker processes among which SuperSuit divides the worlds; 1 is this one
-    :param seed: world w gets seed + w; None draws a seed from NumPy's global generator
+    :param seed: world w gets seed + w; None draws a seed from NumPy's global generator. As in
+        Stable-Baselines3, a model that is made with a seed seeds its worlds anew with that
     :param backend: "batched" steps all worlds in one set of arrays and needs an environment with
         a method ``batched``; "supersuit" takes any environment; "auto" is "batched" where the
         environment offers it and one process is asked for

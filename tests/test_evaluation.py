@@ -5,6 +5,7 @@ import os
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import FAST, SLOW, TwoOnALine
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnRewardThreshold
@@ -314,3 +315,13 @@ class TestCallback:
             model.learn(96, callback=evaluation if evaluate else None)
             learned.append(np.concatenate([p.detach().ravel() for p in model.policy.parameters()]))
         assert np.array_equal(*learned)
+
+    def test_evaluating_on_the_cpu_wakes_no_gpu(self, monkeypatch):
+        forked = []
+        fork = th.random.fork_rng
+        monkeypatch.setattr(
+            th.random, "fork_rng", lambda *a, **k: (forked.append((a, k)), fork(*a, **k))[1]
+        )
+        ppo(worlds()).learn(8, callback=TeamEvalCallback(worlds(), eval_freq=4, verbose=0))
+        assert forked
+        assert all(args == ([],) for args, _ in forked)

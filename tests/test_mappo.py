@@ -133,6 +133,19 @@ class TestShapes:
         assert space.contains(action if action.shape else int(action))
         assert state is None
 
+    @pytest.mark.parametrize(
+        "space", [spaces.Discrete(2, start=1), spaces.MultiDiscrete([2, 3], start=[0, 1])]
+    )
+    def test_numbered_actions_that_begin_elsewhere_are_refused(self, space):
+        class Shifted(TwoOnALine):
+            batched = None
+
+            def action_space(self, agent):
+                return space
+
+        with pytest.raises(ValueError, match="numbered from 0"):
+            make(env=share_parameters(Shifted, 2))
+
     def test_hidden_sizes_can_differ_between_actor_and_critics(self):
         arch = {"pi": [8], "vf": [16, 16], "cvf": [4]}
         policy = make(cost_limits=1.0, policy_kwargs={"net_arch": arch}).policy

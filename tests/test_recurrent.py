@@ -62,6 +62,15 @@ class TestSequences:
         rows = np.concatenate([packed_rows(group, 7)[0] for group in groups])
         assert sorted(rows.tolist()) == list(range(30 * 7))
 
+    @pytest.mark.parametrize("seed", range(10))
+    def test_groups_have_about_equal_numbers_of_steps(self, seed):
+        np.random.seed(seed)
+        lengths = np.array([40] * 10 + [2] * 200)  # 800 steps
+        cut = Cut(np.arange(210), np.zeros(210, int), lengths)
+        sizes = [int(group.lengths.sum()) for group in random_groups(cut, 200)]
+        assert sum(sizes) == 800
+        assert max(sizes) <= 200 + 40  # half a sequence too many at either end
+
     def test_only_sequences_from_the_rollouts_start_carry_a_state_over(self):
         cut = Cut(np.array([1, 0]), np.array([0, 2]), np.array([3, 2]))
         states = th.tensor([[[1.0]], [[2.0]]])

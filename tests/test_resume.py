@@ -20,6 +20,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_e2c import MAPPO, OEMRewardCallback, TeamEvalCallback, share_parameters
 from sb3_e2c.resume import keeps_episodes, load_training_state, training_state
+from sb3_e2c.vec_env import MultiAgentVecEnv
 from sb3_e2c.zoo import resume, train
 from sb3_e2c.zoo.configuration import read_yaml
 from sb3_e2c.zoo.resume import FOLDER, KeepPoints, ProgressFile, newest_point, read_point
@@ -314,11 +315,17 @@ def test_what_spoils_exactness_is_said(copy, capsys, monkeypatch):
     assert read_yaml(config)["n_epochs"] == 1
 
 
-def test_worlds_in_processes_begin_new_episodes(tmp_path, capsys):
+def test_worlds_in_processes_begin_new_episodes(tmp_path, capsys, monkeypatch):
     argv = [*flags(tmp_path), "--vec-env", "subproc"]
     assert in_a_child(argv, kill_at=4 * ROLLOUT + 50) == -signal.SIGKILL
+    seeds = {}  # of the first world, the last that was given
+    seed = MultiAgentVecEnv.seed
+    monkeypatch.setattr(
+        MultiAgentVecEnv, "seed", lambda env, n: (seeds.update({env.n_worlds: n}), seed(env, n))[1]
+    )
     run = train.train(["--resume", str(run_in(tmp_path))])
     assert "begin new episodes" in capsys.readouterr().out
+    assert seeds[2] == 1 + 4 * ROLLOUT  # not those of the seed again
     assert rows(run / "progress.csv")[-1]["time/total_timesteps"] == str(TOTAL)
 
 

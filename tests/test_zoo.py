@@ -21,7 +21,7 @@ pytest.importorskip("rl_zoo3")
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_e2c import E2CMAPPO, GradientMultipliers, OEMRewardCallback
+from sb3_e2c import E2CMAPPO, GradientMultipliers, OEMRewardCallback, evaluate_team
 from sb3_e2c.envs import ENV_IDS
 from sb3_e2c.multipliers import Multipliers
 from sb3_e2c.zoo import cli, configuration, demo, enjoy, resume, train
@@ -752,7 +752,7 @@ def test_enjoy_reports_the_team(trained, capsys):
     assert result["cost_limits"] == [20.0]
     assert 0 <= result["violation_rate"] <= 1
     assert result["deterministic"] is False
-    assert (result["seed"], result["algo"], result["env"]) == (0, "e2c_t", ENV)
+    assert (result["seed"], result["algo"], result["env"]) == (1_000_000, "e2c_t", ENV)
     assert Path(result["model"]) == run_folder(trained) / f"{ENV}.zip"
     assert "sampled actions" in capsys.readouterr().out
 
@@ -957,7 +957,15 @@ def test_plotting_something_else_is_one_line(tmp_path, capsys):
 def test_the_demo_trains_evaluates_films_and_draws(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demo, "EPISODES", 2)
     monkeypatch.setattr(demo, "WORLDS", 2)
+    seeds = []
+
+    def evaluate(model, env, *args, **kwargs):
+        seeds.append(env.unwrapped._seeds[0])
+        return evaluate_team(model, env, *args, **kwargs)
+
+    monkeypatch.setattr(demo, "evaluate_team", evaluate)
     demo.main(["-n", "4800", "-f", str(tmp_path)])
+    assert seeds == [1_000_000, 1_000_000]  # worlds that it was not trained in
     text = capsys.readouterr().out
     for words in ("mean reward", "mean cost", "limit on it", "lambda", "agent steps per second"):
         assert words in text

@@ -1,6 +1,8 @@
 """Many seeds as one curve, one number with an interval, or one comparison.
 
-A seed is one independent run: all intervals and tests here are over seeds, never over episodes.
+A seed is one run: all intervals and tests here are over seeds, never over episodes. Runs are taken as
+independent. Networks and actions are; neighbouring seeds share most of the worlds' random numbers
+(world w has seed + w, as in Stable-Baselines3), though not those of the evaluation.
 """
 
 import warnings

@@ -20,7 +20,7 @@ from sb3_e2c.zoo.console import ConsoleParser, one_line_errors
 from sb3_e2c.zoo.curves import plot_learning
 from sb3_e2c.zoo.enjoy import summarize
 from sb3_e2c.zoo.record import record_episode
-from sb3_e2c.zoo.runs import Run, load_model, make_env, open_run
+from sb3_e2c.zoo.runs import EVALUATION_SEED, Run, load_model, make_env, open_run
 
 ALGO, ENV_ID = "e2c_t", "MultiRover-6-3-v0"
 EPISODES = WORLDS = 100
@@ -61,9 +61,10 @@ def demo(args: argparse.Namespace) -> Path:
 
 def _evaluate(run: Run, seed: int, trained: bool) -> dict[str, Any]:
     """The team with its first or last weights, with sampled actions, on worlds of its own."""
-    with closing(make_env(run, WORLDS, seed + WORLDS)) as env:
+    with closing(make_env(run, WORLDS, seed)) as env:
         make = load_model if trained else _first_model
         model = make(run, env, seed)
+        env.seed(EVALUATION_SEED + seed)  # last: a model seeds its worlds with its own seed
         result = evaluate_team(model, env, EPISODES, deterministic=False)
     return summarize(run, model, result, deterministic=False, seed=seed)
 

@@ -34,6 +34,7 @@ from sb3_e2c.zoo.record import check_video, record_episode
 from sb3_e2c.zoo.runs import (
     Run,
     add_run_flags,
+    add_seed_flag,
     check_seed,
     choose_opponent,
     find_run,
@@ -76,7 +77,7 @@ def make_parser() -> ConsoleParser:
         action=switch,
         help="the adversary takes its most likely actions (default: it samples)",
     )
-    add("--seed", type=int, default=0, help="of worlds and sampled actions (default: 0)")
+    add_seed_flag(parser)
     add("--env-kwargs", nargs="+", action=StoreDict, metavar="KEY:VALUE", help="changed arguments")
     add("--device", default="auto", help="torch device (default: auto)")
     add(

@@ -255,6 +255,7 @@ class TeamExperimentManager(ExperimentManager):
         model = self._new_or_continued(config, env, flags)
         if against is not None and self.args.opponent not in ("own", "random"):
             against.set_opponent(load_opponent(model, against, self.args.opponent))
+        env.seed(self.points.world_seed(self.seed))  # the model has seeded them with its own
         return model
 
     def _new_or_continued(self, config: dict[str, Any], env: VecEnv, flags: Any) -> MAPPO:

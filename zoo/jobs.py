@@ -29,13 +29,13 @@ from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import UserError, one_line_errors
 from sb3_e2c.zoo.results import MODES, Place, read_json, read_table, write_curve, write_json
 from sb3_e2c.zoo.resume import Interrupted, newest_point
+from sb3_e2c.zoo.runs import EVALUATION_SEED
 from sb3_e2c.zoo.suite import Job
 
 BUSY, INTERRUPTED = 75, 76  # exit statuses: another process works on it; stopped before its end
 GRACE = 30.0  # seconds that a stopped job has for saving
 _CURVE_EVERY = 10.0  # seconds
 _BEGIN = "[job]"  # begins each attempt in log.txt
-_EVALUATION_SEEDS = 1_000_000  # worlds that no run has trained in
 _PACKAGES = ("sb3_e2c", "stable_baselines3", "torch", "numpy", "gymnasium", "pettingzoo")
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -157,7 +157,7 @@ def _evaluate(place: Place, mode: str) -> dict[str, Any]:
     job, path = place.job, place.work / f"{mode}.json"
     flags = ["--algo", job.method.algo, "--env", job.env, "-f", str(place.log_folder)]
     flags += ["--n-episodes", str(job.eval_episodes), "--verbose", "0", "--json", str(path)]
-    flags += ["--seed", str(_EVALUATION_SEEDS + 100 * job.seed)]
+    flags += ["--seed", str(EVALUATION_SEED + 100 * job.seed)]
     enjoy.main([*flags, *(["--deterministic"] if mode == "deterministic" else [])])
     result = read_json(path)
     result.pop("model")  # a path on this machine

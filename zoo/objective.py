@@ -22,10 +22,10 @@ from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.zoo.build import build_model, make_worlds, refusals_of
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.enjoy import standard_error
+from sb3_e2c.zoo.runs import EVALUATION_SEED
 from sb3_e2c.zoo.search_space import SearchSpace
 from sb3_e2c.zoo.study import DIVERGED, violation_key
 
-_EVALUATION_SEED = 1_000_000  # worlds that no trial trains in
 _BROKE_OFF = (ValueError, RuntimeError, MemoryError)  # what a training that blows up raises
 
 
@@ -174,7 +174,7 @@ def worlds(env_id: str, config: Mapping[str, Any], n_worlds: int, seed: int) -> 
 @contextlib.contextmanager
 def _eval_worlds(args: argparse.Namespace, config: Mapping[str, Any]) -> Iterator[VecEnv]:
     """The same worlds for every trial."""
-    seed = args.seed + _EVALUATION_SEED
+    seed = args.seed + EVALUATION_SEED
     with worlds(args.env, config, args.n_eval_envs, seed) as env:
         if isinstance(env, VecNormalize):
             env.training = env.norm_reward = False

@@ -42,7 +42,7 @@ from sb3_e2c.zoo.hub import (
     hub_errors,
 )
 from sb3_e2c.zoo.normalization import statistics_path
-from sb3_e2c.zoo.runs import Run, add_run_flags, find_run
+from sb3_e2c.zoo.runs import Run, add_run_flags, add_seed_flag, find_run
 
 # Of args.yml; the other flags are folders, accounts and files of one machine.
 PUBLIC_ARGS = ("algo", "env", "seed", "n_timesteps", "preset")
@@ -72,7 +72,7 @@ def make_parser() -> ConsoleParser:
     )
     add("--n-episodes", type=int, default=100, help="episodes of the evaluation (default: 100)")
     add("--n-envs", type=int, default=10, help="worlds at a time (default: 10)")
-    add("--seed", type=int, default=0, help="of worlds and sampled actions (default: 0)")
+    add_seed_flag(parser)
     add("--device", default="auto", help="torch device (default: auto)")
     add("--no-render", action="store_true", help="no film, as with RL-Zoo")
     add("--verbose", type=int, default=1, help="0: print nothing")

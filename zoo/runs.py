@@ -26,6 +26,8 @@ from sb3_e2c.zoo.configuration import ALGORITHMS, check, check_algo, check_env, 
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.normalization import load_statistics, statistics_path
 
+EVALUATION_SEED = 1_000_000  # worlds that runs with smaller seeds have not trained in
+
 
 @dataclass(frozen=True)
 class Run:
@@ -59,6 +61,20 @@ def add_run_flags(parser: ArgumentParser) -> None:
     which("--load-best", action=switch, help="load the best model instead of the last")
     which("--load-checkpoint", type=int, metavar="STEPS", help="load the checkpoint of this step")
     which("--load-last-checkpoint", action=switch, help="load the last checkpoint")
+
+
+def add_seed_flag(parser: ArgumentParser) -> None:
+    """``--seed`` of an evaluation.
+
+    :param parser: Gets the flag
+    """
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=EVALUATION_SEED,
+        help=f"of worlds and sampled actions (default: {EVALUATION_SEED}, worlds that are new to "
+        "runs with smaller seeds)",
+    )
 
 
 def check_seed(seed: int) -> None:
