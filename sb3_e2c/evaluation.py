@@ -30,6 +30,17 @@ from sb3_e2c.monitor import (
 from sb3_e2c.vec_env import opponent_env
 
 
+def standard_error(samples: np.ndarray) -> np.ndarray:
+    """Standard error of the mean over the first axis; 0 for a single sample.
+
+    :param samples: Shape (E, ...)
+    :return: Shape (...)
+    """
+    if len(samples) < 2:
+        return np.zeros(samples.shape[1:])
+    return samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+
+
 @dataclass(frozen=True)
 class TeamEvaluation:
     """Results of E world episodes of N agents with M costs, in the order of their ends.
@@ -49,7 +60,7 @@ class TeamEvaluation:
     """Steps, shape (E,)"""
 
     def __str__(self) -> str:
-        error = self.returns.std() / np.sqrt(max(len(self.returns) - 1, 1))
+        error = standard_error(self.returns)
         costs = ", ".join(f"{cost:.2f}" for cost in self.mean_costs)
         return (
             f"{len(self.returns)} episodes: return {self.mean_return:.2f} ± {error:.2f}"

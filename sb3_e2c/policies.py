@@ -388,11 +388,13 @@ class TeamPolicy(ActorCriticPolicy):
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Actions, values and log-probabilities of slots in world order.
 
-        Stable-Baselines3's interface. The critics' extra state is taken as zero.
+        Stable-Baselines3's interface, which knows of no other steps: with GRUs these begin an
+        episode.
 
         :param obs: Observations of whole teams, shape (B·N, D)
         :param deterministic: Whether to take the most likely action
         :return: Actions (B·N, ...), values (B·N, 1), log-probabilities (B·N,)
+        :raises ValueError: If critics see more than the observations
         """
         distribution = self.get_distribution(obs)
         actions = distribution.get_actions(deterministic=deterministic)
@@ -416,6 +418,11 @@ class TeamPolicy(ActorCriticPolicy):
         return self.team_values(teams, self._no_critic_state(len(teams)))[0].reshape(-1, 1)
 
     def _no_critic_state(self, n_steps: int) -> th.Tensor:
+        if self.critic_state_dim:
+            raise ValueError(
+                f"these critics see {self.critic_state_dim} numbers of info['critic_state'] beside "
+                "the observations; give them to team_values() or evaluate_steps()"
+            )
         return th.zeros(n_steps, self.critic_state_dim, device=self.device)
 
 

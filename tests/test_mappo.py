@@ -108,6 +108,11 @@ class TestShapes:
         expected = [0, 0.25, 0.5, 0.75] * 2
         assert model.rollout_buffer.critic_states[:, 0, 0].tolist() == expected
 
+    def test_values_without_the_critics_extra_state_are_refused(self):
+        model = make(env=line(critic_state=True))
+        with pytest.raises(ValueError, match=r"see 1 numbers of info\['critic_state'\]"):
+            model.policy.predict_values(th.zeros(2, 3))
+
     @pytest.mark.parametrize(
         "space",
         [

@@ -1,8 +1,8 @@
 """Many seeds as one curve, one number with an interval, or one comparison.
 
-A seed is one run: all intervals and tests here are over seeds, never over episodes. Runs are taken as
-independent. Networks and actions are; neighbouring seeds share most of the worlds' random numbers
-(world w has seed + w, as in Stable-Baselines3), though not those of the evaluation.
+A seed is one run: all intervals and tests here are over seeds, never over episodes. They take runs
+as independent. Networks and actions are; neighbouring seeds share most of the worlds' random
+numbers (world w has seed + w, as in Stable-Baselines3), though not those of the evaluation.
 """
 
 import warnings
@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
+
+from sb3_e2c.evaluation import standard_error
 
 CONFIDENCE = 0.95
 FEWEST_FOR_INTERVAL = 3  # two seeds have three different resamples
@@ -25,9 +27,7 @@ def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     :param values: Shape (R, ...), R seeds
     :return: Both of shape (...)
     """
-    if len(values) < 2:
-        return values.mean(axis=0), np.zeros(values.shape[1:])
-    return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    return values.mean(axis=0), standard_error(values)
 
 
 def on_common_steps(

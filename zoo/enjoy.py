@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
 from sb3_e2c import MAPPO, evaluate_team
-from sb3_e2c.evaluation import TeamEvaluation
+from sb3_e2c.evaluation import TeamEvaluation, standard_error
 from sb3_e2c.vec_env import opponent_env
 from sb3_e2c.zoo.configuration import team_limits
 from sb3_e2c.zoo.console import (
@@ -139,17 +139,6 @@ def summarize(run: Run, model: MAPPO, result: TeamEvaluation, **settings: Any) -
         "episode_length": float(result.lengths.mean()),
         "lambda": _plain(model.multipliers.state_dict()["values"].mean(dim=0).tolist()),
     }
-
-
-def standard_error(samples: np.ndarray) -> np.ndarray:
-    """Standard error of the mean over the first axis; 0 for a single sample.
-
-    :param samples: Shape (E, ...)
-    :return: Shape (...)
-    """
-    if len(samples) < 2:
-        return np.zeros(samples.shape[1:])
-    return samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 def _plain(numbers: Any) -> Any:

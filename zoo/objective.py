@@ -17,11 +17,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import TeamEvalCallback
-from sb3_e2c.evaluation import TeamEvaluation
+from sb3_e2c.evaluation import TeamEvaluation, standard_error
 from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.zoo.build import build_model, make_worlds, refusals_of
 from sb3_e2c.zoo.console import UserError, brief
-from sb3_e2c.zoo.enjoy import standard_error
 from sb3_e2c.zoo.runs import EVALUATION_SEED
 from sb3_e2c.zoo.search_space import SearchSpace
 from sb3_e2c.zoo.study import DIVERGED, violation_key
