@@ -10,6 +10,8 @@ from sb3_e2c.arguments import checked
 from sb3_e2c.callbacks import OEMRewardCallback
 from sb3_e2c.mappo import MAPPO
 
+_NEAREST_NEIGHBOR = {"estimator": "nearest_neighbor", "estimator_kwargs": {"k": 5}}
+
 
 class E2CMAPPO(MAPPO):
     """MAPPO that explores by observation entropy.
@@ -18,22 +20,25 @@ class E2CMAPPO(MAPPO):
     every ``learn``, unless the caller passes one.
 
     :param args: See :class:`MAPPO`
-    :param oem_kwargs: Arguments of the callback; None: the bonus of the 5th nearest neighbor
-        alone ("pure"), as the paper has it for the particle tasks. Without ``psi`` the bonus takes
-        the place of the environment's reward
+    :param oem_kwargs: Arguments of the callback. Without an ``estimator`` the bonus is that of the
+        5th nearest neighbor, as the paper has it for the particle tasks; without ``psi`` it takes
+        the place of the environment's reward ("pure")
     :param kwargs: See :class:`MAPPO`
     """
 
     def __init__(self, *args: Any, oem_kwargs: dict[str, Any] | None = None, **kwargs: Any):
-        if oem_kwargs is None:
-            oem_kwargs = {"estimator": "nearest_neighbor", "estimator_kwargs": {"k": 5}}
-        self.oem_kwargs = oem_kwargs
+        self.oem_kwargs = checked("oem_kwargs", oem_kwargs)
+        if "estimator" not in self.oem_kwargs:
+            self.oem_kwargs = {**_NEAREST_NEIGHBOR, **self.oem_kwargs}
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         self.oem_kwargs = checked("oem_kwargs", self.oem_kwargs)
         super()._setup_model()
-        self._oem_callback = OEMRewardCallback(**{"verbose": self.verbose, **self.oem_kwargs})
+        try:
+            self._oem_callback = OEMRewardCallback(**{"verbose": self.verbose, **self.oem_kwargs})
+        except TypeError as error:
+            raise TypeError(f"oem_kwargs is {self.oem_kwargs}: {error}") from error
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -1,15 +1,15 @@
 """Evaluation of whole teams: world episodes, with their returns and costs."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EventCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, PolicyPredictor
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecMonitor,
@@ -22,6 +22,7 @@ from sb3_e2c.constraints import parse_cost_limits, read_costs, team_costs
 from sb3_e2c.monitor import (
     TeamMonitor,
     add_costs,
+    monitored,
     named_costs,
     raw_rewards,
     team_rewards,
@@ -218,6 +219,22 @@ class _Tally:
         return TeamEvaluation(*(np.stack(column) for column in zip(*self._finished, strict=True)))
 
 
+def evaluations_in(callback: MaybeCallback) -> Iterator[EvalCallback]:
+    """Callbacks that evaluate, also those that others call.
+
+    :param callback: What ``learn`` is given
+    """
+    if isinstance(callback, EvalCallback):
+        yield callback
+    children: Iterable[Any] = ()
+    if isinstance(callback, (list, CallbackList)):
+        children = callback if isinstance(callback, list) else callback.callbacks
+    elif isinstance(callback, EventCallback):
+        children = [callback.callback]
+    for child in children:
+        yield from evaluations_in(child)
+
+
 class TeamEvalCallback(EvalCallback):
     """``EvalCallback`` for teams: counts world episodes and takes safety into account.
 
@@ -251,11 +268,11 @@ class TeamEvalCallback(EvalCallback):
         self._best_score = (-np.inf, -np.inf)
 
     def _init_callback(self) -> None:
-        # MAPPO puts a monitor around its environment by itself; the two have to be alike.
+        # MAPPO gives a monitor to its environment by itself; the two have to be alike.
         if is_vecenv_wrapped(self.training_env, TeamMonitor) and not is_vecenv_wrapped(
             self.eval_env, VecMonitor
         ):
-            self.eval_env = TeamMonitor(self.eval_env)
+            self.eval_env = monitored(self.eval_env)
         _share_opponent(self.training_env, self.eval_env)
         if self.cost_limits is None:
             self.cost_limits = parse_cost_limits(getattr(self.model, "cost_limits", None))

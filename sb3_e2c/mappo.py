@@ -42,8 +42,9 @@ from sb3_e2c.constraints import (
     violation,
 )
 from sb3_e2c.descent import Descent, update_threads
+from sb3_e2c.evaluation import evaluations_in
 from sb3_e2c.losses import normalize
-from sb3_e2c.monitor import named_costs
+from sb3_e2c.monitor import monitored, named_costs
 from sb3_e2c.multipliers import GradientMultipliers, Multipliers
 from sb3_e2c.objective import Weights
 from sb3_e2c.opponents import adversary_path, load_learner
@@ -52,7 +53,15 @@ from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
 from sb3_e2c.sequences import Memory
-from sb3_e2c.teams import check_actions, check_batch, check_subclass, check_team, monitored, team_of
+from sb3_e2c.teams import (
+    check_batch,
+    check_env,
+    check_policy,
+    check_spaces,
+    check_subclass,
+    check_team,
+    team_of,
+)
 from sb3_e2c.vec_env import OpponentVecEnv, opponent_env, share_parameters
 
 _ADVICE = "Lower learning_rate or reward_scale, or use normalize_values=True"
@@ -159,6 +168,7 @@ class MAPPO(PPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        check_policy(policy, self.policy_aliases)
         self.cost_limits = parse_cost_limits(cost_limits)
         self.cost_scope = cost_scope
         self.cost_gamma = cost_gamma
@@ -213,7 +223,9 @@ class MAPPO(PPO):
         if isinstance(env, (ParallelEnv, AECEnv)):
             world = env
             env = share_parameters(lambda: world, n_worlds=1)
-        return monitored(OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
+        env = OnPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        check_env(env)
+        return monitored(env)
 
     @property
     def n_agents(self) -> int:
@@ -295,7 +307,7 @@ class MAPPO(PPO):
     def _check_setup(self) -> None:
         settle(self)
         check_batch(self.n_agents, self.batch_size)
-        check_actions(self.action_space)
+        check_spaces(self.observation_space, self.action_space)
         check_subclass("policy_class", self.policy_class, TeamPolicy)
         check_subclass("multipliers_class", self.multipliers_class, Multipliers)
         if self.env is not None:
@@ -685,6 +697,8 @@ class MAPPO(PPO):
         progress_bar: bool = False,
     ) -> "MAPPO":
         """Train until that many agent steps are done; see ``PPO.learn``."""
+        if self.env is None:
+            raise ValueError("the model has no environment; give load() one, or call set_env()")
         name = tb_log_name or type(self).__name__
         self._log_interval = log_interval or 1
         every = None if log_interval is None else 1  # dump_logs() passes over the others
@@ -696,6 +710,11 @@ class MAPPO(PPO):
             reset_num_timesteps,
             progress_bar,
         )
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        for evaluation in evaluations_in(callback):  # as the training's, see monitored()
+            evaluation.eval_env = monitored(evaluation.eval_env)
+        return super()._init_callback(callback, progress_bar)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "multipliers"], []
@@ -754,8 +773,21 @@ class MAPPO(PPO):
         :param env: Where to go on
         :param kwargs: Of ``PPO.load``
         :raises FileNotFoundError: If there is no adversary beside the model
+        :raises ValueError: If other cost_limits or another cost_scope need other networks
         """
-        model = super().load(path, env, **kwargs)
+        try:
+            model = super().load(path, env, **kwargs)
+        except RuntimeError as error:
+            changed = sorted({"cost_limits", "cost_scope"} & kwargs.keys())
+            if not changed:
+                raise
+            raise ValueError(
+                f"{' and '.join(changed)}: {path} has cost critics for other limits; expected as "
+                "many limits as it was trained with, and its cost_scope. Make a new model instead, "
+                "and give it the old actor: new.policy.load_state_dict(actor, strict=False), where "
+                "actor is the part of old.policy.state_dict() whose names begin with "
+                "mlp_extractor.policy_net, action_net, log_std or actor_gru"
+            ) from error
         if hasattr(model, "oem_kwargs") and not hasattr(model, "_oem_callback"):
             raise ValueError(
                 f"{path} holds a team that learns from an entropy bonus, which {cls.__name__} "

@@ -6,7 +6,12 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecMonitor,
+    is_vecenv_wrapped,
+    unwrap_vec_normalize,
+)
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_e2c.constraints import read_costs, team_costs
@@ -98,6 +103,28 @@ class TeamMonitor(VecMonitor):
             )
         if self.results_writer is not None:
             self.results_writer.write_row(record)
+
+
+def monitored(env: VecEnv) -> VecEnv:
+    """Add a monitor to an environment of teams that has none.
+
+    It comes below all wrappers, so that environments that were wrapped alike stay alike; wrappers
+    get it as their new ``venv``.
+
+    :param env: Perhaps wrapped
+    :return: The environment, with a monitor if it consists of teams
+    """
+    team = env.unwrapped
+    if not isinstance(team, MultiAgentVecEnv) or is_vecenv_wrapped(env, TeamMonitor):
+        return env
+    monitor = TeamMonitor(team)
+    if env is team:
+        return monitor
+    lowest: Any = env
+    while lowest.venv is not team:
+        lowest = lowest.venv
+    lowest.venv = monitor
+    return env
 
 
 def _csv_path(filename: str) -> str:

@@ -129,7 +129,7 @@ class GruPolicy(TeamPolicy):
         :param observation: Shape (D,) or (n, D)
         :param state: ``(h,)`` with h of shape (1, n, H), as returned by the last call; None at the
             start of an episode
-        :param episode_start: Where to begin with a zero state, shape (n,)
+        :param episode_start: Where to begin with a zero state, shape (n,), or one bool for all
         :param deterministic: Whether to take the most likely action
         :return: Actions, shape (...) or (n, ...), and the next ``(h,)``
         """
@@ -140,7 +140,13 @@ class GruPolicy(TeamPolicy):
         if state is not None:
             states = th.as_tensor(state[0][0], device=self.device)
             if episode_start is not None:
-                running = ~np.asarray(episode_start, dtype=bool)
+                starts = np.asarray(episode_start, dtype=bool)
+                if starts.shape not in ((), (len(obs),)):
+                    raise ValueError(
+                        f"episode_start has the shape {starts.shape}; expected ({len(obs)},), one "
+                        "for each observation"
+                    )
+                running = np.broadcast_to(~starts, len(obs)).copy()
                 states = states * th.as_tensor(running, device=self.device)[:, None]
         with th.no_grad():
             states = self._step(obs, states)

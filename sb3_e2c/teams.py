@@ -1,5 +1,6 @@
 """What an algorithm needs to know of its team, and what it refuses."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -7,23 +8,36 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
-from sb3_e2c.monitor import TeamMonitor
-from sb3_e2c.vec_env import MultiAgentVecEnv
 
-
-def monitored(env: VecEnv) -> VecEnv:
-    """Add a monitor to an environment of teams that has none.
+def check_env(env: VecEnv) -> None:
+    """Refuse SuperSuit's own environment, which hides who belongs to which team, and dicts.
 
     :param env: Given by the user
-    :raises TypeError: if it is SuperSuit's own, which hides who belongs to which team
     """
     if is_vecenv_wrapped(env, SB3VecEnvWrapper):
         raise TypeError(
             "env is SuperSuit's own vector environment, which does not say how many agents "
             "share a world; use sb3_e2c.share_parameters(make_env, n_worlds=...) instead"
         )
-    is_team = isinstance(env.unwrapped, MultiAgentVecEnv)
-    return TeamMonitor(env) if is_team and not is_vecenv_wrapped(env, TeamMonitor) else env
+    if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
+        raise ValueError(
+            f"the observation space is {env.observation_space}; expected vectors, images or "
+            "numbers. Flatten observations in a PettingZoo wrapper, for example with "
+            "gymnasium.spaces.flatten"
+        )
+
+
+def check_policy(policy: Any, known: Collection[str]) -> None:
+    """Refuse a name of a policy that teams do not have.
+
+    :param policy: What the user gave
+    :param known: Names of those that they have
+    """
+    if isinstance(policy, str) and policy not in known:
+        raise ValueError(
+            f"policy is {policy!r}; expected one of {sorted(known)}, or a subclass of TeamPolicy. "
+            "For images add policy_kwargs={'features_extractor_class': NatureCNN}"
+        )
 
 
 def team_of(env: VecEnv | None) -> tuple[list[str], int]:
@@ -67,16 +81,25 @@ def check_batch(n_agents: int, batch_size: int) -> None:
         )
 
 
-def check_actions(space: spaces.Space) -> None:
-    """Refuse numbered actions that do not begin at 0, as those of the networks do.
+def check_spaces(observations: spaces.Space, actions: spaces.Space) -> None:
+    """Refuse spaces that the networks would misunderstand.
 
-    :param space: The actions of an agent
+    :param observations: Of an agent
+    :param actions: Of an agent
     """
-    if np.any(getattr(space, "start", 0)):
+    for kind, space in (("observation", observations), ("action", actions)):
+        if np.any(getattr(space, "start", 0)):
+            raise ValueError(
+                f"the {kind} space is {space}; expected numbers from 0 on, as Stable-Baselines3 "
+                "does. Shift them in a PettingZoo wrapper"
+            )
+    if isinstance(actions, spaces.Box) and not (actions.shape and actions.dtype.kind == "f"):
         raise ValueError(
-            f"the action space is {space}; expected actions that are numbered from 0 on, as "
-            "Stable-Baselines3 does. Shift them in a PettingZoo wrapper's step"
+            f"the action space is {actions}; expected floating-point numbers and at least one "
+            "dimension, such as Box(-1, 1, (2,)); for whole numbers use Discrete or MultiDiscrete"
         )
+    if isinstance(actions, spaces.MultiDiscrete) and len(actions.shape) != 1:
+        raise ValueError(f"the action space is {actions}; expected one dimension: flatten it")
 
 
 def check_subclass(name: str, given: Any, kind: type) -> None:

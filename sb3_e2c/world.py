@@ -154,7 +154,7 @@ class World(BaseParallelWrapper):
                 f"{call}() of world {self.index} returned {' and '.join(kinds)} with nothing for "
                 f"the agents {list(missing)}; expected all of {self.agents}, because each has a "
                 "slot of its own until all end together. Keep ended agents in the environment "
-                "(zero reward, any observation)"
+                "(reward and cost of zero, any observation)"
             )
 
     def _check_end(self, terminated: Mapping[str, bool], truncated: Mapping[str, bool]) -> None:
@@ -164,7 +164,7 @@ class World(BaseParallelWrapper):
             raise ValueError(
                 f"the agents {ended} of world {self.index} ended while {others} go on; expected "
                 "all agents of a world to end in the same step. Keep ended agents in the "
-                "environment (zero reward, any observation), or end the episode for all"
+                "environment (reward and cost of zero, any observation), or end the episode for all"
             )
 
 

@@ -96,7 +96,7 @@ def test_a_job_survives_its_way_to_another_process(place):
 
 def test_seeds_may_be_ranges():
     assert benchmark.parse_seeds(["3", "5-7", "3"]) == [3, 5, 6, 7]
-    for word in ("x", "-1", "5-3"):
+    for word in ("x", "-1", "5-3", "0-9999999999", str(2**32)):
         with pytest.raises(UserError, match="--seeds"):
             benchmark.parse_seeds([word])
 

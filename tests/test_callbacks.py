@@ -234,6 +234,12 @@ def test_verbose_tells_which_bonus_is_given(capsys):
     ]
 
 
+def test_e2c_takes_the_nearest_neighbor_unless_told_otherwise():
+    model = E2CMAPPO("MlpPolicy", None, _init_setup_model=False, oem_kwargs={"psi": 0.1})
+    assert model.oem_kwargs["estimator"] == "nearest_neighbor"
+    assert model.oem_kwargs["psi"] == 0.1
+
+
 @pytest.mark.parametrize("algorithm", [MAPPO, E2CMAPPO])
 def test_mappo_learns_from_the_bonus_and_reports_the_extrinsic_return(algorithm, two_on_a_line):
     # every observation is "something, something, something": visits 1 to 4 of each episode

@@ -8,10 +8,17 @@ import pytest
 import torch as th
 from conftest import FAST, SLOW, TwoOnALine
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnRewardThreshold
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_e2c import MAPPO
 from sb3_e2c.evaluation import TeamEvalCallback, TeamEvaluation, evaluate_team
 from sb3_e2c.monitor import TeamMonitor
 from sb3_e2c.vec_env import share_parameters
@@ -280,6 +287,20 @@ class TestCallback:
         self.train(tmp_path, env=env, eval_env=eval_env)
         assert np.array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
         assert eval_env.obs_rms.mean.any()
+
+    @pytest.mark.parametrize("monitored", [False, True])
+    @pytest.mark.parametrize("kind", [EvalCallback, TeamEvalCallback])
+    def test_mappo_makes_both_environments_alike(self, kind, monitored):
+        env, own = VecNormalize(worlds()), worlds()
+        eval_env = VecNormalize(TeamMonitor(own) if monitored else own, training=False)
+        callback = EveryNTimesteps(8, kind(eval_env, eval_freq=1, n_eval_episodes=2, verbose=0))
+        settings = {"n_steps": 4, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
+        model = MAPPO("MlpPolicy", env, **settings)
+        model.learn(16, callback=[CallbackList([callback])])
+        assert np.array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
+        assert isinstance(env.venv, TeamMonitor)
+        assert isinstance(eval_env.venv, TeamMonitor)
+        assert eval_env.venv.venv is own
 
     def test_environments_that_are_wrapped_differently_are_refused(self, tmp_path):
         env = VecNormalize(TeamMonitor(worlds(n_costs=2)))

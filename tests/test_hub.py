@@ -425,7 +425,7 @@ def test_a_loaded_team_is_the_next_run(repository):
 
 
 def test_a_run_that_appears_meanwhile_is_not_overwritten(repository, monkeypatch):
-    monkeypatch.setattr(load, "get_latest_run_id", lambda *_: 0)
+    monkeypatch.setattr(load, "latest_run_id", lambda *_: 0)
     taken = Path("logs", ALGO, f"{ENV}_1")
     taken.mkdir(parents=True)
     (taken / "mine").write_text("mine")

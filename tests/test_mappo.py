@@ -36,6 +36,27 @@ def line(n_worlds=2, backend="auto", **kwargs):
     return share_parameters(lambda: TwoOnALine(**kwargs), n_worlds, backend=backend)
 
 
+def with_spaces(observation_space=None, action_space=None):
+    """The same task, whose agents claim to see or do something else."""
+
+    class Claims(TwoOnALine):
+        batched = None
+
+        def observation_space(self, agent):
+            return observation_space or super().observation_space(agent)
+
+        def action_space(self, agent):
+            return action_space or super().action_space(agent)
+
+        def reset(self, seed=None, options=None):
+            seen, infos = super().reset(seed, options)
+            return seen if observation_space is None else {
+                agent: observation_space.sample() for agent in seen
+            }, infos
+
+    return share_parameters(Claims, 2)
+
+
 def make(algorithm=MAPPO, env=None, **kwargs):
     return algorithm("MlpPolicy", env or line(), **{**SMALL, **kwargs})
 
@@ -142,14 +163,31 @@ class TestShapes:
         "space", [spaces.Discrete(2, start=1), spaces.MultiDiscrete([2, 3], start=[0, 1])]
     )
     def test_numbered_actions_that_begin_elsewhere_are_refused(self, space):
-        class Shifted(TwoOnALine):
-            batched = None
+        with pytest.raises(ValueError, match=r"action space is .*; expected numbers from 0 on"):
+            make(env=with_spaces(action_space=space))
 
-            def action_space(self, agent):
-                return space
+    @pytest.mark.parametrize(
+        ("space", "message"),
+        [
+            (spaces.Box(0, 3, (2,), np.int32), "expected floating-point numbers"),
+            (spaces.Box(-1.0, 1.0, ()), "at least one dimension"),
+            (spaces.MultiDiscrete([[2, 3], [2, 3]]), "expected one dimension"),
+        ],
+        ids=["integers", "scalar", "table"],
+    )
+    @pytest.mark.filterwarnings("ignore:.*multi-dimensional MultiDiscrete")
+    def test_actions_of_another_shape_or_type_are_refused(self, space, message):
+        with pytest.raises(ValueError, match=message):
+            make(env=with_spaces(action_space=space))
 
-        with pytest.raises(ValueError, match="numbered from 0"):
-            make(env=share_parameters(Shifted, 2))
+    def test_observations_that_the_networks_cannot_read_are_refused(self):
+        numbers = spaces.Discrete(3, start=1)
+        with pytest.raises(ValueError, match=r"observation space is .*; expected numbers from 0"):
+            make(env=with_spaces(observation_space=numbers))
+        with pytest.raises(ValueError, match="expected vectors, images or numbers"):
+            make(env=with_spaces(observation_space=spaces.Dict(x=spaces.Box(0.0, 1.0, (2,)))))
+        with pytest.raises(ValueError, match=r"policy is 'CnnPolicy'; expected one of \['Gru"):
+            MAPPO("CnnPolicy", line())
 
     def test_hidden_sizes_can_differ_between_actor_and_critics(self):
         arch = {"pi": [8], "vf": [16, 16], "cvf": [4]}
@@ -362,6 +400,26 @@ class TestSaving:
             obs, rewards, _, _, _ = env.step(actions)
             total += sum(rewards.values())
         assert total == flattened.returns[0]
+
+    @pytest.mark.parametrize("changed", [{"cost_limits": 2.0}, {"cost_scope": "individual"}])
+    def test_other_limits_at_loading_are_explained(self, tmp_path, changed):
+        make(cost_limits=None if "cost_limits" in changed else 1.0).save(tmp_path / "model")
+        with pytest.raises(ValueError, match=f"{next(iter(changed))}: .* for other limits"):
+            MAPPO.load(tmp_path / "model", env=line(), **changed)
+
+    def test_the_advice_of_that_works(self):
+        old, new = make().learn(32), make(cost_limits=1.0)
+        parts = ("mlp_extractor.policy_net", "action_net", "log_std", "actor_gru")
+        actor = {k: v for k, v in old.policy.state_dict().items() if k.startswith(parts)}
+        new.policy.load_state_dict(actor, strict=False)
+        obs = np.random.default_rng(0).random((8, 3), np.float32)
+        actions = [model.predict(obs, deterministic=True)[0] for model in (old, new)]
+        assert np.array_equal(*actions)
+
+    def test_a_model_without_an_environment_says_so(self, tmp_path):
+        make().save(tmp_path / "model")
+        with pytest.raises(ValueError, match="the model has no environment"):
+            MAPPO.load(tmp_path / "model").learn(32)
 
     def test_a_model_of_another_team_is_refused(self, tmp_path):
         make().save(tmp_path / "model")

@@ -189,6 +189,11 @@ def test_an_agent_alone_acts_as_in_the_team_and_a_new_episode_forgets():
     _, fresh = model.predict(obs[0])
     np.testing.assert_allclose(after[0][0, 2], fresh[0][0, 2], atol=1e-6)
     assert not np.allclose(after[0][0, 1], fresh[0][0, 1])
+    for start, expected in ((True, model.predict(step[2])), (False, model.predict(step[2], own))):
+        _, found = model.predict(step[2], own, episode_start=start)
+        np.testing.assert_allclose(found[0], expected[1][0])
+    with pytest.raises(ValueError, match=r"episode_start has the shape \(2,\); expected \(1,\)"):
+        model.predict(step[2], own, episode_start=[True, False])
 
 
 def test_a_loaded_model_goes_on(tmp_path):

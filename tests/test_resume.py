@@ -329,6 +329,29 @@ def test_worlds_in_processes_begin_new_episodes(tmp_path, capsys, monkeypatch):
     assert rows(run / "progress.csv")[-1]["time/total_timesteps"] == str(TOTAL)
 
 
+def test_a_run_beyond_its_new_end_is_not_called_done(tmp_path, capsys):
+    assert in_a_child(flags(tmp_path), kill_at=4 * ROLLOUT + 50) == -signal.SIGKILL
+    with pytest.raises(SystemExit):
+        train.main(["--resume", str(run_in(tmp_path)), "-n", str(2 * ROLLOUT)])
+    error = capsys.readouterr().err
+    assert f"{4 * ROLLOUT} agent steps are done, more than -n {2 * ROLLOUT}, and the mo" in error
+
+
+def test_an_error_of_a_callback_leaves_a_point_to_go_on_from(tmp_path, monkeypatch):
+    def fail(self):
+        if self.num_timesteps == 3 * ROLLOUT + 120:
+            raise KeyError("mine")
+        return True
+
+    monkeypatch.setattr(KeepPoints, "_on_step", fail)
+    monkeypatch.setattr(resume, "_KEEP_EVERY", 0.0)
+    argv = flags(tmp_path)
+    argv[argv.index("--resume-every") + 1] = "1000"
+    with pytest.raises(KeyError, match="mine"):
+        train.train(argv)
+    assert newest_point(run_in(tmp_path)).steps == 3 * ROLLOUT
+
+
 # ---------------------------------------------------------------------------- the parts
 
 

@@ -676,6 +676,7 @@ def test_help_shows_the_preset_among_rl_zoos_flags(capsys):
         (["-params", "cost_limits:[1.0,2.0]"], "there are 2 cost limits"),
         (["-params", "oem_kwargs.estimator:novelty"], "novelty"),
         (["-params", "callback:no.such.Callback"], "no.such.Callback"),
+        (["-params", "callback:collections.OrderedDict"], "expected callbacks of Stable"),
         (["--env-kwargs", "max_cylces:10"], "did you mean 'max_cycles'"),
         (["--env-kwargs", "max_cycles:0"], "max_cycles is 0"),
         (["--eval-env-kwargs", "max_cycles:0"], "max_cycles is 0"),
@@ -784,6 +785,26 @@ def test_enjoy_loads_other_models_of_the_run(trained, flags, name):
     assert Path(run_enjoy(trained, *flags)["model"]).name == name
 
 
+def test_runs_are_found_in_a_folder_with_brackets(tmp_path):
+    folder = tmp_path / "logs [1]"
+    for number in (1, 2):
+        run_train(folder, "--save-freq", str(ROLLOUT), "-tb", str(tmp_path / "tb [1]"))
+        assert run_folder(folder, number).is_dir()
+    assert Path(run_enjoy(folder)["model"]).parent == run_folder(folder, 2)
+    last = run_enjoy(folder, "--load-last-checkpoint")
+    assert Path(last["model"]).name == f"rl_model_{2 * ROLLOUT}_steps.zip"
+    logs = [path.name for path in (tmp_path / "tb [1]" / ENV).iterdir()]
+    assert sorted(logs) == ["e2c_t_1", "e2c_t_2"]
+
+
+def test_a_run_without_a_model_can_be_finished_or_an_older_one_taken(copy, capsys):
+    shutil.copytree(run_folder(copy), run_folder(copy, 2))
+    (run_folder(copy, 2) / f"{ENV}.zip").unlink()
+    line = refusal(capsys, enjoy.main, ["--env", ENV, "-f", copy])
+    assert f"sb3-e2c train --resume {run_folder(copy, 2)}, or choose another run" in line
+    assert line.endswith("--exp-id 1")
+
+
 def test_weights_alone_give_the_same_team_as_the_whole_file(trained):
     assert run_enjoy(trained) == run_enjoy(trained, "--trust")
 
@@ -873,6 +894,7 @@ def test_enjoy_films_one_episode(trained, tmp_path, suffix):
         (["--algo", "mappo"], "sb3-e2c train --algo mappo"),
         (["--exp-id", "7"], f"{ENV}_7"),
         (["--load-checkpoint", "7"], "rl_model_7_steps.zip"),
+        (["--load-checkpoint", "7"], f"checkpoints there: {ROLLOUT}, {2 * ROLLOUT}"),
         (["--n-episodes", "0"], "--n-episodes is 0"),
         (["--n-envs", "-1"], "--n-envs is -1"),
         (["--seed", "-1"], "--seed is -1"),

@@ -38,6 +38,7 @@ from sb3_e2c.zoo.pools import LocalPool, Pool, RayPool
 from sb3_e2c.zoo.results import Place, read_json
 from sb3_e2c.zoo.suite import Job, check_methods, find_suite, read_suite, suite_names, suite_text
 
+_MOST_SEEDS = 10_000  # of a range: more is a slip of the hand
 _LOOK_EVERY = 1.0  # seconds
 _PRINT_EVERY = 60.0  # seconds between lines where lines cannot be overwritten
 
@@ -77,7 +78,13 @@ def parse_seeds(words: Sequence[str] | None) -> list[int] | None:
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", word)
         if match is None or int(match[2] or match[1]) < int(match[1]):
             raise UserError(f"--seeds: found {word!r}, expected numbers such as 0 3 5-9")
-        seeds.update(dict.fromkeys(range(int(match[1]), int(match[2] or match[1]) + 1)))
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last >= 2**32 or last - first >= _MOST_SEEDS:
+            raise UserError(
+                f"--seeds: found {word!r}, expected numbers below 2**32, and at most "
+                f"{_MOST_SEEDS:,} of them"
+            )
+        seeds.update(dict.fromkeys(range(first, last + 1)))
     return list(seeds)
 
 

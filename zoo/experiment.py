@@ -23,7 +23,6 @@ from stable_baselines3.common.callbacks import (
     ProgressBarCallback,
 )
 from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
-from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import MAPPO, TeamEvalCallback
@@ -53,6 +52,7 @@ from sb3_e2c.zoo.configuration import (
 from sb3_e2c.zoo.console import UserError, brief, write_whole
 from sb3_e2c.zoo.normalization import load_statistics, save_statistics, statistics_path
 from sb3_e2c.zoo.resume import KeepPoints, Resumable, ignore_stop_signals, tensorboard_format
+from sb3_e2c.zoo.runs import latest_run_id
 
 # What a continued run may change: numbers that a loaded model reads anew in each rollout.
 _CHANGEABLE = (
@@ -204,7 +204,7 @@ class TeamExperimentManager(ExperimentManager):
 
     def create_log_folder(self) -> None:
         """Make the run's folder; another training may have taken its number in the meantime."""
-        number = get_latest_run_id(self.log_path, self.env_name)
+        number = latest_run_id(Path(self.log_path), self.env_name)
         while not self.args.resume:
             try:
                 os.makedirs(self.save_path)
@@ -218,9 +218,16 @@ class TeamExperimentManager(ExperimentManager):
 
     def _own_callbacks(self, config: dict[str, Any]) -> list[BaseCallback]:
         try:
-            return get_callback_list(config)
+            callbacks = get_callback_list(config)
         except (ImportError, AttributeError, TypeError, ValueError, AssertionError) as error:
             raise UserError(f"callback {config['callback']!r}: {error}") from error
+        for each in callbacks:
+            if not isinstance(each, BaseCallback):
+                raise UserError(
+                    f"callback {config['callback']!r}: it made {brief(repr(each))}; expected "
+                    "callbacks of Stable-Baselines3"
+                )
+        return callbacks
 
     def _rehearse(self, config: dict[str, Any]) -> None:
         """Build worlds and model once without a trace, so that mistakes show before the run."""
@@ -376,6 +383,10 @@ class TeamExperimentManager(ExperimentManager):
             there = os.path.exists(self.save_path)
             kept = f"; {self.save_path} keeps what was saved before" if there else ""
             raise UserError(f"training stopped: {brief(error)}{kept}") from error
+        except Exception:  # of a callback, for instance: its traceback says what is wrong
+            with contextlib.suppress(OSError):
+                self.points.write()
+            raise
         finally:
             ignore_stop_signals()
             self._release(model)
@@ -403,7 +414,7 @@ class TeamExperimentManager(ExperimentManager):
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
             if self.points.tensorboard is None:
-                run = get_latest_run_id(self.tensorboard_log, self.algo) + 1
+                run = latest_run_id(Path(self.tensorboard_log), self.algo) + 1
                 folder = os.path.join(self.tensorboard_log, f"{self.algo}_{run}")
                 self.points.tensorboard = os.path.abspath(folder)
             formats.append(tensorboard_format(self.points.tensorboard, self.points.steps))

@@ -19,7 +19,6 @@ import yaml
 from huggingface_hub import HfApi, hf_hub_url
 from huggingface_hub.hf_api import ModelInfo, RepoSibling
 from huggingface_hub.utils import build_hf_headers, get_session, hf_raise_for_status
-from rl_zoo3.utils import get_latest_run_id
 
 from sb3_e2c.zoo.archives import check_archive, is_inside
 from sb3_e2c.zoo.configuration import check, check_algo, check_env, read_yaml
@@ -33,6 +32,7 @@ from sb3_e2c.zoo.console import (
 )
 from sb3_e2c.zoo.hub import LARGEST, MODEL, NEEDED, check_repo_id, hub_errors
 from sb3_e2c.zoo.push import PUBLIC_ARGS, plain_yaml
+from sb3_e2c.zoo.runs import latest_run_id
 
 _CONFIGURATION = ("config.yml", "args.yml")
 _DEEPEST = 20  # levels of YAML
@@ -269,7 +269,7 @@ def _next_run(run: Path, logs: Path, env_id: str) -> Path:
 
 
 def _targets(logs: Path, env_id: str) -> Iterator[Path]:
-    number = get_latest_run_id(str(logs), env_id)
+    number = latest_run_id(logs, env_id)
     while True:
         number += 1
         yield logs / f"{env_id}_{number}"

@@ -6,7 +6,6 @@ config.yml and only weights are read from its file (unless you --trust it).
 """
 
 import argparse
-import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -30,7 +29,16 @@ from sb3_e2c.zoo.console import (
     check_file,
     one_line_errors,
 )
-from sb3_e2c.zoo.runs import Run, add_run_flags, check_seed, find_run, load_model, make_env
+from sb3_e2c.zoo.runs import (
+    Run,
+    add_run_flags,
+    check_seed,
+    checkpoint_name,
+    checkpoint_steps,
+    find_run,
+    load_model,
+    make_env,
+)
 
 
 def make_parser() -> ConsoleParser:
@@ -103,11 +111,13 @@ def checkpoints(run: Run) -> list[tuple[str, Run]]:
 
     :param run: One of its models
     """
-    found = {}
-    for path in run.folder.glob("rl_model_*_steps.zip"):
-        if match := re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name):
-            found[int(match[1])] = replace(run, model_path=path)
-    return [(f"trained for {steps:,} agent steps", found[steps]) for steps in sorted(found)]
+    return [
+        (
+            f"trained for {steps:,} agent steps",
+            replace(run, model_path=run.folder / checkpoint_name(steps)),
+        )
+        for steps in checkpoint_steps(run.folder)
+    ]
 
 
 def _make_stage(run: Run, args: argparse.Namespace) -> VecEnv:

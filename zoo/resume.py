@@ -336,7 +336,7 @@ class Resumable:
 
         :param config: Its configuration
         :param total: Agent steps at which a resumed run shall end; -1: as it was started
-        :raises UserError: if another process trains it, or there is no point
+        :raises UserError: if another process trains it, there is no point, or it is beyond total
         :raises NothingToDo: if it has come to its end
         """
         self._config = json.loads(json.dumps(dict(config), default=str))
@@ -354,8 +354,14 @@ class Resumable:
         self.tensorboard = self.start.about["tensorboard"]
         planned = self.start.about["total"]
         self.total = total if total > 0 else planned
-        if self.steps >= self.total or (self.start.is_last and self.total == planned):
-            raise NothingToDo(f"{self.run}: nothing to do, {self.steps:,} agent steps are done")
+        done = f"{self.steps:,} agent steps are done"
+        if self.start.is_last and (self.steps >= self.total or self.total == planned):
+            raise NothingToDo(f"{self.run}: nothing to do, {done}")
+        if self.steps >= self.total:
+            raise UserError(
+                f"{self.run}: {done}, more than -n {self.total}, and the model has not been saved "
+                "since; expected a larger -n, or none to finish the run"
+            )
         if self.total != planned:
             print(f"To {self.total:,} agent steps, not {planned:,}; schedules follow the new total")
 

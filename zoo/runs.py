@@ -1,14 +1,12 @@
 """Find a run of ``train`` and bring its model back, for every command that uses one."""
 
-import contextlib
-import io
+import re
+import shlex
 from argparse import ArgumentParser, Namespace
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import get_model_path
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import MAPPO
@@ -25,6 +23,7 @@ from sb3_e2c.zoo.build import (
 from sb3_e2c.zoo.configuration import ALGORITHMS, check, check_algo, check_env, merge, read_yaml
 from sb3_e2c.zoo.console import UserError, brief
 from sb3_e2c.zoo.normalization import load_statistics, statistics_path
+from sb3_e2c.zoo.resume import how_to_go_on
 
 EVALUATION_SEED = 1_000_000  # worlds that runs with smaller seeds have not trained in
 
@@ -94,16 +93,73 @@ def find_run(args: Namespace) -> Run:
     """
     check_algo(args.algo)
     check_env(args.env)
-    which = (args.load_best, args.load_checkpoint, args.load_last_checkpoint)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it reports what enjoy reports better
-            _, model_path, folder = get_model_path(
-                args.exp_id, args.folder, args.algo, EnvironmentName(args.env), *which
-            )
-    except (AssertionError, ValueError, OSError) as error:
-        hint = f"train one with: sb3-e2c train --algo {args.algo} --env {args.env}"
-        raise UserError(f"{error}; {hint}") from None
-    return open_run(Path(folder), args.algo, args.env, Path(model_path))
+    logs = Path(args.folder, args.algo)
+    number = args.exp_id or latest_run_id(logs, args.env)
+    folder = logs / f"{args.env}_{number}" if number > 0 else logs
+    if not folder.is_dir():
+        raise UserError(
+            f"{folder} was not found; train one with: sb3-e2c train --algo {args.algo} "
+            f"--env {args.env} -f {shlex.quote(args.folder)}"
+        )
+    model_path = folder / _model_name(args, folder)
+    if not model_path.is_file():
+        raise UserError(f"{model_path} was not found; {_what_else(args, folder)}")
+    return open_run(folder, args.algo, args.env, model_path)
+
+
+def latest_run_id(logs: Path, env_id: str) -> int:
+    """Number of the latest run; 0 if there is none.
+
+    Not RL-Zoo's, which finds nothing in folders whose names have brackets.
+
+    :param logs: The folder of an algorithm's runs
+    :param env_id: The environment
+    """
+    found = (re.fullmatch(rf"{re.escape(env_id)}_(\d+)", path.name) for path in logs.glob("*"))
+    return max((int(match[1]) for match in found if match), default=0)
+
+
+def checkpoint_steps(folder: Path) -> list[int]:
+    """Steps at which a run saved checkpoints, in order.
+
+    :param folder: The run's folder
+    """
+    names = (path.name for path in folder.glob("rl_model_*_steps.zip"))
+    found = (re.fullmatch(r"rl_model_(\d+)_steps\.zip", name) for name in names)
+    return sorted(int(match[1]) for match in found if match)
+
+
+def checkpoint_name(steps: int) -> str:
+    """The file of a checkpoint.
+
+    :param steps: When it was saved
+    """
+    return f"rl_model_{steps}_steps.zip"
+
+
+def _model_name(args: Namespace, folder: Path) -> str:
+    """Which file of a run the flags ask for."""
+    if args.load_best:
+        return "best_model.zip"
+    if args.load_checkpoint is not None:
+        return checkpoint_name(args.load_checkpoint)
+    if args.load_last_checkpoint:
+        steps = checkpoint_steps(folder)
+        return checkpoint_name(steps[-1]) if steps else "rl_model_*_steps.zip"
+    return f"{args.env}.zip"
+
+
+def _what_else(args: Namespace, folder: Path) -> str:
+    """Advice for somebody who asks for a model that a run does not have."""
+    if args.load_checkpoint is not None or args.load_last_checkpoint:
+        steps = checkpoint_steps(folder)
+        return f"checkpoints there: {brief(', '.join(map(str, steps)) or 'none')}"
+    if args.load_best:
+        return "train with --eval-freq for a best model, or leave --load-best away for the last one"
+    older = (path.parent.name for path in folder.parent.glob(f"{args.env}_*/{args.env}.zip"))
+    numbers = sorted(int(n) for n in (name.rpartition("_")[2] for name in older) if n.isdigit())
+    others = f", or choose another run: --exp-id {brief(', '.join(map(str, numbers)))}"
+    return f"finish it with: {how_to_go_on(folder)}{others if numbers else ''}"
 
 
 def open_run(folder: Path, algo: str, env_id: str, model_path: Path | None = None) -> Run:
