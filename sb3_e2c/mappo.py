@@ -2,7 +2,7 @@
 
     env.step ─► o' (S, D), r (S,), infos["cost"]       Alg. 2 l. 5-7
       callbacks may edit r in place                    Alg. 1 (OEMRewardCallback)
-      TeamRolloutBuffer.add ... finish                 critics, GAE for r and every cost, l. 12
+      Collector ─► TeamRolloutBuffer                   critics, GAE for r and every cost, l. 12
     train:  λ ← multipliers.update(J − l)              l. 11, Eq. 7
             Ã = A_r − Σ λⱼ A_cⱼ, clipped surrogate     l. 13, Eq. 8
             regression of all critics                  l. 14, 16
@@ -33,6 +33,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_e2c.arguments import checked, making, settle
 from sb3_e2c.buffers import TeamRolloutBuffer, TeamSamples
+from sb3_e2c.collector import Collector
 from sb3_e2c.constraints import (
     CostScope,
     check_cost_scope,
@@ -52,7 +53,6 @@ from sb3_e2c.policies import TeamPolicy
 from sb3_e2c.recorder import TeamRecorder
 from sb3_e2c.recurrent import GruPolicy
 from sb3_e2c.saving import atomic_write
-from sb3_e2c.sequences import Memory
 from sb3_e2c.teams import (
     check_batch,
     check_env,
@@ -212,7 +212,7 @@ class MAPPO(PPO):
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
         self.agents, self.critic_state_dim = team_of(self.env)
-        self._recorder: TeamRecorder | None = None
+        self._collector: Collector | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -323,7 +323,7 @@ class MAPPO(PPO):
         env = self._wrap_env(env, self.verbose)
         check_team(env, self.agents, self.critic_state_dim)
         super().set_env(env, force_reset)
-        self._recorder = None
+        self._collector = None
         self._attach_opponent()
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
@@ -331,7 +331,7 @@ class MAPPO(PPO):
         self._attach_opponent()
         last_obs = self._last_obs
         result = super()._setup_learn(total_timesteps, *args, **kwargs)
-        if self._recorder is None or self._last_obs is not last_obs:  # the environment was reset
+        if self._collector is None or self._last_obs is not last_obs:  # the environment was reset
             env = self.env
             assert env is not None
             assert self._last_obs is not None
@@ -365,157 +365,63 @@ class MAPPO(PPO):
         :param n_rollout_steps: Steps of each world
         :return: False if a callback stopped the training
         """
-        assert self._last_obs is not None, "no previous observation: learn() resets first"
-        self.begin_rollout()
+        collector = self._collector
+        assert collector is not None, "learn() makes it"
+        collector.begin_rollout()
         opponents = opponent_env(env)
         learner = None if opponents is None else opponents.learner
         if learner is not None:
             learner.begin_rollout(n_rollout_steps)
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
-            actions, clipped_actions = self.act()
+            with self.explained_divergence():
+                actions, clipped_actions = collector.act()
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             assert isinstance(new_obs, np.ndarray)
-            self.check(new_obs, rewards, infos)
+            collector.check(new_obs, rewards, infos)
             rewards = self.reward_scale * rewards
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             go_on = callback.on_step()
             self._update_info_buffer(infos, dones)
-            self.record(actions, rewards, new_obs, dones, infos, env.unwrapped.reset_infos)
+            collector.record(actions, rewards, new_obs, dones, infos, env.unwrapped.reset_infos)
+            self._last_obs, self._last_episode_starts = new_obs, dones
             if not go_on:  # only now: a later learn() may continue the running episodes
                 if learner is not None:
                     learner.stop_rollout()
                 return False
-        self.finish_rollout()
+        collector.finish_rollout()
         if learner is not None:
             learner.finish_rollout(self.logger)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
 
-    # What `collect_rollouts` does for a team, somebody who has stepped the environment can do for
-    # others in it: see LearningOpponents.
-
     def start_episodes(
         self,
         observations: np.ndarray,
         reset_infos: Sequence[dict[str, Any]],
         team_cost: str = "sum",
-    ) -> None:
+    ) -> Collector:
         """Begin anew after a reset of all worlds.
 
         :param observations: Shape (S, D)
         :param reset_infos: One dict for each slot
         :param team_cost: How the costs of agents make the team's, "sum" or "max"
+        :return: What acts and fills the rollout buffer from here on
         """
-        n_worlds = len(observations) // self.n_agents
-        self._recorder = TeamRecorder(
+        recorder = TeamRecorder(
             self.agents,
-            n_worlds=n_worlds,
+            n_worlds=len(observations) // self.n_agents,
             n_constraints=len(self.cost_limits),
             cost_scope=self.cost_scope,
             team_cost=team_cost,
             critic_state_dim=self.critic_state_dim,
         )
-        self._recorder.start(observations, reset_infos)
-        self._last_obs = observations
-        self._last_episode_starts = np.ones(len(observations), bool)
-        self._memory = self.policy.empty_memory(n_worlds)
-
-    def begin_rollout(self) -> None:
-        """Forget the last rollout; running episodes go on."""
-        assert self._recorder is not None, "start_episodes() makes the recorder"
-        self.policy.set_training_mode(False)
-        self._memory = self._running(self._memory, self._last_episode_starts)
-        self.rollout_buffer.reset(self._memory if self.policy.recurrent else None)
-        self._recorder.finished_costs.clear()
-
-    def act(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sample actions of all slots on the last observations.
-
-        :return: The actions, and what the environment accepts of them, shapes (S, ...)
-        """
-        states = self._memory.actor.flatten(0, 1)
-        actions, states = self._sample_actions(self._last_obs, states)
-        self._memory = self._memory._replace(actor=states.view_as(self._memory.actor))
-        return actions, self._clip_actions(actions)
-
-    def check(
-        self, new_obs: np.ndarray, rewards: np.ndarray, infos: Sequence[dict[str, Any]]
-    ) -> None:
-        """Stop if an environment returned numbers that are not finite.
-
-        :param new_obs: Shape (S, D)
-        :param rewards: Shape (S,)
-        :param infos: One dict for each slot
-        """
-        assert self._recorder is not None, "start_episodes() makes the recorder"
-        self._recorder.check(self.rollout_buffer.pos, new_obs, rewards, infos)
-
-    def record(
-        self,
-        actions: np.ndarray,
-        rewards: np.ndarray,
-        new_obs: np.ndarray,
-        dones: np.ndarray,
-        infos: Sequence[dict[str, Any]],
-        reset_infos: Sequence[dict[str, Any]],
-    ) -> None:
-        """Store what came of the last actions.
-
-        :param actions: As :meth:`act` gave them, shape (S, ...)
-        :param rewards: Shape (S,)
-        :param new_obs: Shape (S, D)
-        :param dones: Whether the step ended an episode, shape (S,)
-        :param infos: One dict for each slot
-        :param reset_infos: One dict for each slot, new where an episode ended
-        """
-        assert self._recorder is not None, "start_episodes() makes the recorder"
-        self._recorder.record(
-            self.rollout_buffer,
-            last_obs=self._last_obs,  # type: ignore[arg-type]
-            episode_starts=self._last_episode_starts,  # type: ignore[arg-type]
-            actions=actions,
-            rewards=rewards,
-            dones=dones,
-            infos=infos,
-            reset_infos=reset_infos,
+        self._collector = Collector(
+            self.policy, self.rollout_buffer, recorder, observations, reset_infos
         )
-        self._last_obs, self._last_episode_starts = new_obs, dones
-
-    def finish_rollout(self) -> None:
-        """Evaluate all networks on the rollout and compute the advantages."""
-        assert self._recorder is not None, "start_episodes() makes the recorder"
-        critics = self.rollout_buffer.finish(
-            self.policy, np.asarray(self._last_obs), self._recorder.critic_states
-        )
-        self._memory = Memory(self._memory.actor, *critics)
-
-    def _sample_actions(self, obs: Any, states: th.Tensor) -> tuple[np.ndarray, th.Tensor]:
-        """Actions, and the actor's next hidden states, of all slots."""
-        with th.no_grad():
-            tensor, _ = self.policy.obs_to_tensor(obs)
-            if self.policy.recurrent:
-                running = th.as_tensor(~np.asarray(self._last_episode_starts, bool))
-                states = states * running.to(states)[:, None]
-            with self._explained_divergence():
-                actions, states = self.policy.act(tensor, states)  # type: ignore[arg-type]
-                array = actions.cpu().numpy()
-                if not np.isfinite(array).all():
-                    raise ValueError("an action is not finite")
-        return array.reshape(len(obs), *self.action_space.shape), states  # type: ignore[misc]
-
-    def _running(self, memory: Memory, episode_starts: Any) -> Memory:
-        """Hidden states with those of worlds at the start of an episode set to zero."""
-        running = ~np.asarray(episode_starts[:: self.n_agents], dtype=bool)
-        factor = th.as_tensor(running, device=self.device)[:, None, None]
-        return Memory(*(states * factor for states in memory))
-
-    def _clip_actions(self, actions: np.ndarray) -> np.ndarray:
-        if isinstance(self.action_space, spaces.Box):
-            return np.clip(actions, self.action_space.low, self.action_space.high)
-        return actions
+        return self._collector
 
     # ------------------------------------------------------------------ learning
 
@@ -565,7 +471,7 @@ class MAPPO(PPO):
         for batch, sequences in batches:
             if self.normalize_advantage:
                 batch = batch._replace(advantages=normalize(batch.advantages))
-            with self._explained_divergence():
+            with self.explained_divergence():
                 terms = descent.gradient(batch, sequences, weights)
             loss = terms.loss(weights)
             for name, number in (*terms._asdict().items(), ("loss", loss)):
@@ -610,7 +516,7 @@ class MAPPO(PPO):
         )
 
     @contextmanager
-    def _explained_divergence(self) -> Iterator[None]:
+    def explained_divergence(self) -> Iterator[None]:
         """Say what it means when torch refuses the parameters of an action distribution."""
         try:
             yield
@@ -622,8 +528,8 @@ class MAPPO(PPO):
 
     def _update_multipliers(self) -> None:
         """One dual step from the episodes that finished in this rollout; none without episodes."""
-        assert self._recorder is not None, "learn() makes the recorder"
-        finished_costs = self._recorder.finished_costs
+        assert self._collector is not None, "learn() makes it"
+        finished_costs = self._collector.finished_costs
         if finished_costs and len(self.cost_limits):
             excess = violation(np.array(finished_costs), self._aims)
             self.multipliers.update(th.as_tensor(excess, dtype=th.float32, device=self.device))
@@ -720,7 +626,7 @@ class MAPPO(PPO):
         return ["policy", "policy.optimizer", "multipliers"], []
 
     def _excluded_save_params(self) -> list[str]:
-        own = ("_recorder", "_memory", "stop_epochs", "opponent", "_adversary_file")
+        own = ("_collector", "stop_epochs", "opponent", "_adversary_file")
         return [*super()._excluded_save_params(), *own]
 
     def save(

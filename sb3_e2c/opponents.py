@@ -182,7 +182,7 @@ class LearningOpponents(Opponents):
 
     @override
     def start(self, observations: np.ndarray, seed: int | None) -> None:
-        self.model.start_episodes(observations, [{}] * len(observations))
+        self.collector = self.model.start_episodes(observations, [{}] * len(observations))
         self._returns = np.zeros(self.n_worlds)
         self._finished: list[float] = []
 
@@ -196,28 +196,29 @@ class LearningOpponents(Opponents):
                 f"the opponents' model has n_steps={self.model.n_steps} and the team {n_steps}; "
                 "expected equal ones, because both learn from the same rollouts"
             )
-        self.model.begin_rollout()
+        self.collector.begin_rollout()
         self._collecting = True
         self._finished.clear()
 
     @override
     def act(self) -> np.ndarray:
-        self._actions, clipped = self.model.act()
+        with self.model.explained_divergence():
+            self._actions, clipped = self.collector.act()
         return clipped
 
     @override
     def observe(self, step: Step) -> None:
         dones = close_episodes(step)
         self._count(step.rewards, dones)
-        model = self.model
+        model, observations = self.model, step.observations
         if not self._collecting:  # somebody evaluates, or trains by an algorithm of their own
-            check_finite(self.side.agents, "after a step", observation=step.observations)
-            model._last_obs, model._last_episode_starts = step.observations, dones
+            check_finite(self.side.agents, "after a step", observation=observations)
+            self.collector.follow(observations, dones)
             return
         model.num_timesteps += len(dones)
         rewards = model.reward_scale * step.rewards
-        model.check(step.observations, rewards, infos=())
-        model.record(self._actions, rewards, step.observations, dones, step.infos, step.infos)
+        self.collector.check(observations, rewards, infos=())
+        self.collector.record(self._actions, rewards, observations, dones, step.infos, step.infos)
         self._collecting = not model.rollout_buffer.full
 
     def _count(self, rewards: np.ndarray, dones: np.ndarray) -> None:
@@ -237,7 +238,7 @@ class LearningOpponents(Opponents):
         :param logger: The team's; our keys get a prefix
         """
         self.model.set_logger(_PrefixLogger(logger))
-        self.model.finish_rollout()
+        self.collector.finish_rollout()
         if self._finished:
             self.model.logger.record("rollout/ep_rew_mean", float(np.mean(self._finished)))
 

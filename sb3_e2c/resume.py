@@ -26,6 +26,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_e2c.callbacks import OEMRewardCallback
+from sb3_e2c.collector import Collector
 from sb3_e2c.entropy import EntropyEstimator
 from sb3_e2c.mappo import MAPPO
 from sb3_e2c.monitor import TeamMonitor
@@ -58,8 +59,9 @@ _CHANGING: dict[type, _Changing] = {
             *("num_timesteps", "_num_timesteps_at_start", "_n_updates", "_episode_num"),
             *("_current_progress_remaining", "ep_info_buffer", "ep_success_buffer", "start_time"),
         ),
-        episodes=("_last_obs", "_last_original_obs", "_last_episode_starts", "_memory"),
+        episodes=("_last_obs", "_last_original_obs", "_last_episode_starts"),
     ),
+    Collector: _Changing(episodes=("observations", "episode_starts", "memory")),
     TeamRecorder: _Changing(episodes=("episode_costs", "critic_states")),
     TeamMonitor: _Changing(
         always=("episode_count", "t_start"),
@@ -144,7 +146,7 @@ def load_training_state(model: MAPPO, callback: BaseCallback, pickled: bytes) ->
         pending = getattr(model.logger, name)
         pending.clear()
         pending.update(values)
-    model.begin_rollout()
+    _collector(model).begin_rollout()
     opponents = opponent_env(model.env)
     if opponents is not None and opponents.learner is not None:
         opponents.learner.begin_rollout(model.n_steps)
@@ -173,7 +175,13 @@ def _parts(model: MAPPO, callback: BaseCallback, episodes: bool) -> Iterator[tup
 
 def _model_parts(name: str, model: MAPPO) -> Iterator[tuple[str, Any]]:
     yield name, model
-    yield f"{name}.recorder", model._recorder
+    yield f"{name}.collector", _collector(model)
+    yield f"{name}.recorder", _collector(model).recorder
+
+
+def _collector(model: MAPPO) -> Collector:
+    assert model._collector is not None, "learn() makes it"
+    return model._collector
 
 
 def _env_parts(name: str, env: VecEnv) -> Iterator[tuple[str, Any]]:

@@ -286,7 +286,7 @@ class TrustRegionMonitor(BaseCallback):
         buffer, policy = rollout.buffer, self.model.policy
         rows, sequences = team_rows(buffer, rollout.initial)
         self._follow_actor()
-        with _evaluating(policy), th.no_grad(), self.model._explained_divergence():
+        with _evaluating(policy), th.no_grad(), self.model.explained_divergence():
             log_prob = _log_prob(policy, buffer, rows, sequences)
         self._release()
         new = ActorOutputs(self._raw, _log_std(policy), log_prob.cpu().view(-1, buffer.n_agents))

@@ -470,7 +470,7 @@ class TestGoingOn:
         model = make(cost_limits=0.0, multipliers_kwargs={"learning_rate": 1.0})
         all_fast(model).learn(10_000, callback=StopTrainingOnMaxEpisodes(max_episodes=1))
         model.learn(32, reset_num_timesteps=False)
-        assert np.ravel(model._recorder.finished_costs).tolist() == [8.0] * 4
+        assert np.ravel(model._collector.finished_costs).tolist() == [8.0] * 4
 
     @pytest.mark.parametrize("limits", [5.0, [5.0]])
     def test_a_limit_can_be_changed_while_loading(self, tmp_path, limits):

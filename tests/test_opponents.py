@@ -264,7 +264,13 @@ class OwnRandomness:
     def __init__(self, model, seed=5):
         self.torch = th.Generator().manual_seed(seed).get_state()
         self.numpy = np.random.RandomState(seed).get_state()
-        model.act, model.train = self.wrapped(model.act), self.wrapped(model.train)
+        self.start_episodes = model.start_episodes
+        model.start_episodes, model.train = self.start, self.wrapped(model.train)
+
+    def start(self, *args):
+        collector = self.start_episodes(*args)
+        collector.act = self.wrapped(collector.act)
+        return collector
 
     def wrapped(self, method):
         def call():
