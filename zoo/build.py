@@ -8,12 +8,15 @@ import os
 import pickle
 import zipfile
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from rl_zoo3.utils import get_callback_list
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -70,6 +73,25 @@ def make_worlds(
             size = len(agents) * spaces.flatdim(env.observation_space(agents[0]))
         _check_memory(f"{n_worlds} worlds", n_worlds * size)
         return share_parameters(make_env, n_worlds, n_processes, seed=seed)
+
+
+def own_callbacks(config: Mapping[str, Any]) -> list[BaseCallback]:
+    """New callbacks, as a configuration names them.
+
+    :param config: The configuration
+    :raises UserError: if there are no such callbacks
+    """
+    try:
+        callbacks = get_callback_list(deepcopy(dict(config)))
+    except (ImportError, AttributeError, TypeError, ValueError, AssertionError) as error:
+        raise UserError(f"callback {config['callback']!r}: {error}") from error
+    for each in callbacks:
+        if not isinstance(each, BaseCallback):
+            raise UserError(
+                f"callback {config['callback']!r}: it made {brief(repr(each))}; expected callbacks "
+                "of Stable-Baselines3"
+            )
+    return callbacks
 
 
 def _check_memory(what: str, n_floats: int) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import ALGOS, get_callback_list
+from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -38,6 +38,7 @@ from sb3_e2c.zoo.build import (
     go_on_from,
     load_opponent,
     make_worlds,
+    own_callbacks,
     refusals_of,
 )
 from sb3_e2c.zoo.configuration import (
@@ -187,7 +188,7 @@ class TeamExperimentManager(ExperimentManager):
         self.n_timesteps = self.n_timesteps if self.n_timesteps > 0 else config["n_timesteps"]
         self.env_kwargs = config.get("env_kwargs") or {}
         self._preprocess_normalization(deepcopy(config))
-        self.callbacks = self._own_callbacks(config)
+        self.callbacks = own_callbacks(config)
         self._rehearse(config)
         if self.verbose > 0:
             self._describe(config)
@@ -215,19 +216,6 @@ class TeamExperimentManager(ExperimentManager):
                 self.params_path = os.path.join(self.save_path, self.env_name)
                 self.points = self._resumable()
         super().create_log_folder()
-
-    def _own_callbacks(self, config: dict[str, Any]) -> list[BaseCallback]:
-        try:
-            callbacks = get_callback_list(config)
-        except (ImportError, AttributeError, TypeError, ValueError, AssertionError) as error:
-            raise UserError(f"callback {config['callback']!r}: {error}") from error
-        for each in callbacks:
-            if not isinstance(each, BaseCallback):
-                raise UserError(
-                    f"callback {config['callback']!r}: it made {brief(repr(each))}; expected "
-                    "callbacks of Stable-Baselines3"
-                )
-        return callbacks
 
     def _rehearse(self, config: dict[str, Any]) -> None:
         """Build worlds and model once without a trace, so that mistakes show before the run."""

@@ -6,21 +6,18 @@ Not RL-Zoo's objective, which evaluates rows instead of teams, and before the la
 import argparse
 import contextlib
 from collections.abc import Iterator, Mapping
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import optuna
-from rl_zoo3.utils import get_callback_list
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_e2c import TeamEvalCallback
 from sb3_e2c.evaluation import TeamEvaluation, standard_error
 from sb3_e2c.monitor import TeamMonitor
-from sb3_e2c.zoo.build import build_model, make_worlds, refusals_of
-from sb3_e2c.zoo.console import UserError, brief
+from sb3_e2c.zoo.build import build_model, make_worlds, own_callbacks, refusals_of
+from sb3_e2c.zoo.console import brief
 from sb3_e2c.zoo.runs import EVALUATION_SEED
 from sb3_e2c.zoo.search_space import SearchSpace
 from sb3_e2c.zoo.study import DIVERGED, violation_key
@@ -128,18 +125,6 @@ class Objective:
             callbacks = [*own_callbacks(config), evaluation]
             model.learn(n_steps(args, config), callback=callbacks, log_interval=None)  # type: ignore[arg-type]
             return evaluation.final()
-
-
-def own_callbacks(config: Mapping[str, Any]) -> list[BaseCallback]:
-    """New callbacks, as a configuration names them.
-
-    :param config: The configuration
-    :raises UserError: if there are no such callbacks
-    """
-    try:
-        return get_callback_list(deepcopy(dict(config)))
-    except (ImportError, AttributeError, TypeError, ValueError, AssertionError) as error:
-        raise UserError(f"callback {config['callback']!r}: {error}") from error
 
 
 def n_steps(args: argparse.Namespace, config: Mapping[str, Any]) -> int:

@@ -30,7 +30,7 @@ from filelock import FileLock, Timeout
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_e2c.vec_env import opponent_env
-from sb3_e2c.zoo.build import build_model
+from sb3_e2c.zoo.build import build_model, own_callbacks
 from sb3_e2c.zoo.configuration import ALGORITHMS, check_algo, check_env, parse_presets, preset_names
 from sb3_e2c.zoo.console import (
     ConsoleParser,
@@ -42,7 +42,7 @@ from sb3_e2c.zoo.console import (
     write_whole,
 )
 from sb3_e2c.zoo.experiment import configure
-from sb3_e2c.zoo.objective import Objective, n_steps, own_callbacks, worlds
+from sb3_e2c.zoo.objective import Objective, n_steps, worlds
 from sb3_e2c.zoo.resume import Interrupted, stop_signals
 from sb3_e2c.zoo.runs import check_seed
 from sb3_e2c.zoo.search_space import SearchSpace
