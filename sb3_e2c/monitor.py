@@ -109,7 +109,8 @@ def monitored(env: VecEnv) -> VecEnv:
     """Add a monitor to an environment of teams that has none.
 
     It comes below all wrappers, so that environments that were wrapped alike stay alike; wrappers
-    get it as their new ``venv``.
+    get it as their new ``venv``. Only above Stable-Baselines3's own monitor, which would replace
+    its records.
 
     :param env: Perhaps wrapped
     :return: The environment, with a monitor if it consists of teams
@@ -117,9 +118,9 @@ def monitored(env: VecEnv) -> VecEnv:
     team = env.unwrapped
     if not isinstance(team, MultiAgentVecEnv) or is_vecenv_wrapped(env, TeamMonitor):
         return env
+    if env is team or is_vecenv_wrapped(env, VecMonitor):
+        return TeamMonitor(env)
     monitor = TeamMonitor(team)
-    if env is team:
-        return monitor
     lowest: Any = env
     while lowest.venv is not team:
         lowest = lowest.venv

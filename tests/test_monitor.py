@@ -10,7 +10,7 @@ from conftest import FAST, SLOW, TwoOnALine
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import load_results
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
 from sb3_e2c import MAPPO, evaluate_team
 from sb3_e2c.monitor import TeamMonitor
@@ -103,6 +103,14 @@ def test_the_file_has_one_row_for_each_episode_of_a_world(tmp_path):
     assert list(table[0]) == ["r", "l", "t", "cost_0", "cost_1"]
     assert [(float(row["r"]), float(row["cost_1"])) for row in table] == [(6, 4)] * 6
     assert len(load_results(str(tmp_path))) == 6
+
+
+@pytest.mark.parametrize("wrap", [VecMonitor, VecNormalize, VecCheckNan])
+def test_episodes_are_teams_whatever_the_environment_was_wrapped_in(wrap):
+    env = wrap(share_parameters(lambda: TwoOnALine(length=4), 2))
+    model = MAPPO("MlpPolicy", env, n_steps=8, batch_size=16, device="cpu").learn(32)
+    assert "cost" in model.ep_info_buffer[0]
+    assert model.ep_info_buffer[0]["r"] >= 8  # both agents', 1 to 2 a step each
 
 
 def test_more_of_the_last_info_can_be_recorded():
