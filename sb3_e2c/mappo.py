@@ -307,7 +307,6 @@ class MAPPO(PPO):
     def _check_setup(self) -> None:
         settle(self)
         check_batch(self.n_agents, self.batch_size)
-        check_spaces(self.observation_space, self.action_space)
         check_subclass("policy_class", self.policy_class, TeamPolicy)
         check_subclass("multipliers_class", self.multipliers_class, Multipliers)
         if self.env is not None:
@@ -317,6 +316,7 @@ class MAPPO(PPO):
                 "env is None; expected what share_parameters() returns, because it says how large "
                 "the networks are; load() needs none"
             )
+        check_spaces(self.observation_space, self.action_space)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Use another environment with the same team; see ``PPO.set_env``."""
