@@ -60,6 +60,8 @@ class GradientMultipliers(Multipliers):
         takes the paper's literal step (docs/paper.md, D8)
     :param pooled: Move all parties' multipliers alike, by their mean violation. Individual
         constraints then limit the team as a whole, while every agent answers for its own cost
+    :param largest_violation: A larger one counts as this much, in units of cost. At first costs
+        may be a hundred times what is allowed; a step that suits what comes later would overshoot
     """
 
     def __init__(
@@ -70,18 +72,20 @@ class GradientMultipliers(Multipliers):
         maximum: float = math.inf,
         agent_scaling: bool = True,
         pooled: bool = False,
+        largest_violation: float = math.inf,
     ):
         super().__init__(shape)
         _check_form(shape, agent_scaling=agent_scaling, pooled=pooled)
-        _check(learning_rate=learning_rate, initial=initial, maximum=maximum)
+        _check(initial, maximum, largest_violation, learning_rate=learning_rate)
         self.learning_rate = learning_rate * (shape[0] if agent_scaling else 1)
         self.maximum = maximum
         self.pooled = pooled
+        self.largest_violation = largest_violation
         self.register_buffer("values", th.full(shape, float(initial)))
 
     def update(self, violation: th.Tensor) -> None:
         """See :meth:`Multipliers.update`."""
-        violation = _pool(violation) if self.pooled else violation
+        violation = _counted(violation, self.pooled, self.largest_violation)
         self.values.add_(_times(self.learning_rate, violation)).clamp_(0.0, self.maximum)
 
 
@@ -101,6 +105,7 @@ class PIDMultipliers(Multipliers):
     :param maximum: λ_max, also the limit of the integral
     :param agent_scaling: See :class:`GradientMultipliers`; scales all three gains
     :param pooled: See :class:`GradientMultipliers`
+    :param largest_violation: See :class:`GradientMultipliers`; Δ is at most this
     """
 
     integral: th.Tensor
@@ -116,21 +121,23 @@ class PIDMultipliers(Multipliers):
         maximum: float = math.inf,
         agent_scaling: bool = True,
         pooled: bool = False,
+        largest_violation: float = math.inf,
     ):
         super().__init__(shape)
         _check_form(shape, agent_scaling=agent_scaling, pooled=pooled)
-        _check(kp=kp, ki=ki, kd=kd, initial=initial, maximum=maximum)
+        _check(initial, maximum, largest_violation, kp=kp, ki=ki, kd=kd)
         scale = shape[0] if agent_scaling else 1
         self.kp, self.ki, self.kd = scale * kp, scale * ki, scale * kd
         self.maximum = maximum
         self.pooled = pooled
+        self.largest_violation = largest_violation
         self.register_buffer("values", th.full(shape, float(initial)))
         self.register_buffer("integral", self.values.clone())
         self.register_buffer("previous", th.full(shape, math.inf))  # no increase at first
 
     def update(self, violation: th.Tensor) -> None:
         """See :meth:`Multipliers.update`."""
-        violation = _pool(violation) if self.pooled else violation
+        violation = _counted(violation, self.pooled, self.largest_violation)
         increase = (violation - self.previous).nan_to_num(0.0).clamp_(min=0.0)
         self.previous.copy_(violation)
         self.integral.add_(_times(self.ki, violation)).clamp_(0.0, self.maximum)
@@ -138,9 +145,11 @@ class PIDMultipliers(Multipliers):
         self.values.copy_(values.clamp_(0.0, self.maximum))
 
 
-def _pool(violation: th.Tensor) -> th.Tensor:
-    """The mean over the parties, for each of them; shape (K, M)."""
-    return violation.mean(dim=0, keepdim=True).expand_as(violation)
+def _counted(violation: th.Tensor, pooled: bool, largest: float) -> th.Tensor:
+    """What moves the multipliers: pooled, the mean over the parties for each; shape (K, M)."""
+    if pooled:
+        violation = violation.mean(dim=0, keepdim=True).expand_as(violation)
+    return violation.clamp(max=largest)
 
 
 def _times(gain: float, violation: th.Tensor) -> th.Tensor:
@@ -157,11 +166,14 @@ def _check_form(shape: Any, **flags: Any) -> None:
             raise TypeError(f"multipliers: {name} is {value!r}; expected True or False")
 
 
-def _check(initial: float, maximum: float, **gains: float) -> None:
-    for name, value in {"initial": initial, "maximum": maximum, **gains}.items():
+def _check(initial: float, maximum: float, largest_violation: float, **gains: float) -> None:
+    bounds = {"initial": initial, "maximum": maximum, "largest_violation": largest_violation}
+    for name, value in {**bounds, **gains}.items():
         is_number = isinstance(value, Real) and not isinstance(value, bool)
         if not is_number or not value >= 0 or not fits_torch(value):
             raise ValueError(f"multipliers: {name} is {value!r}; expected a number of at least 0")
+    if largest_violation == 0:
+        raise ValueError("multipliers: largest_violation is 0; expected more, or λ never rises")
     if not math.isfinite(initial) or initial > maximum:
         raise ValueError(
             f"multipliers: initial is {initial!r}; expected a finite number of at most {maximum!r}"

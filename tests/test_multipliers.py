@@ -66,6 +66,20 @@ def test_pid_adds_the_violation_and_the_rise_of_the_cost():
     assert trajectory(pid, [10, 15, -5]) == pytest.approx([1.1, 2.75, 0.0])
 
 
+def test_a_violation_beyond_the_largest_counts_as_the_largest():
+    # gradient: 0.05·4, + 0.05·3, − 0.05·6; pooled: the mean of 2 and 10 is 6, and counts as 4
+    gradient = GradientMultipliers((1, 1), largest_violation=4.0)
+    assert trajectory(gradient, [100, 3, -6]) == pytest.approx([0.2, 0.35, 0.05])
+    pooled = GradientMultipliers(
+        (2, 1), 0.05, agent_scaling=False, pooled=True, largest_violation=4.0
+    )
+    pooled.update(th.tensor([[2.0], [10.0]]))
+    assert pooled.values.flatten().tolist() == pytest.approx([0.2, 0.2])
+    # PID: p 0.1·4 + i 0.01·4, then the same p, no rise (4 after 4), and i 0.08
+    pid = PIDMultipliers((1, 1), kp=0.1, ki=0.01, kd=0.2, largest_violation=4.0)
+    assert trajectory(pid, [100, 50]) == pytest.approx([0.44, 0.48])
+
+
 @pytest.mark.parametrize("cls", [GradientMultipliers, PIDMultipliers])
 def test_an_infinite_limit_never_costs_anything(cls):
     assert trajectory(cls((1, 1)), [-math.inf, -math.inf]) == [0.0, 0.0]
@@ -82,3 +96,8 @@ def test_saved_and_loaded_multipliers_go_on_alike(cls):
 def test_a_negative_gain_is_refused():
     with pytest.raises(ValueError, match="multipliers: kp is -1; expected a number of at least 0"):
         PIDMultipliers((1, 1), kp=-1)
+
+
+def test_a_largest_violation_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="largest_violation is 0; expected more"):
+        GradientMultipliers((1, 1), largest_violation=0)
