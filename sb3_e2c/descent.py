@@ -57,7 +57,10 @@ class Descent:
 
     def __enter__(self) -> "Descent":
         if self._is_halved and n_cores() > 1:
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix="sb3_e2c-update")
+            # Torch forgets in new threads how many of its own MKL may use.
+            self._pool = ThreadPoolExecutor(
+                1, "sb3_e2c-update", initializer=th.set_num_threads, initargs=(1,)
+            )
         return self
 
     def __exit__(self, *_: object) -> None:
