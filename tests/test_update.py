@@ -569,11 +569,17 @@ def test_an_error_on_either_thread_ends_the_update_and_the_thread(
 def test_updates_leave_no_threads_and_the_number_of_torch_s_threads(monkeypatch):
     before = threading.active_count()
     monkeypatch.setattr(th, "get_num_threads", lambda: 3)
-    chosen = []
-    monkeypatch.setattr(th, "set_num_threads", chosen.append)
+    chosen, of_others = [], []
+    main = threading.current_thread()
+
+    def choose(number):
+        (chosen if threading.current_thread() is main else of_others).append(number)
+
+    monkeypatch.setattr(th, "set_num_threads", choose)
     model = learned("MlpPolicy", 2, monkeypatch)
     assert threading.active_count() == before
     assert chosen == [1, 3] * (len(chosen) // 2) != []
+    assert of_others == [1] * 3  # once in each update's second thread
     assert model._n_updates == 3 * 2
 
 
