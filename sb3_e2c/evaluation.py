@@ -28,6 +28,7 @@ from sb3_e2c.monitor import (
     team_rewards,
     unwrap_team,
 )
+from sb3_e2c.saving import atomic_write
 from sb3_e2c.vec_env import opponent_env
 
 
@@ -331,16 +332,15 @@ class TeamEvalCallback(EvalCallback):
         successes = {}
         if self.evaluations_successes:
             successes = {"successes": self.evaluations_successes}
-        # A run that is killed while it writes keeps the file of the evaluation before.
-        np.savez(
-            f"{self.log_path}.tmp.npz",
-            timesteps=self.evaluations_timesteps,
-            results=self.evaluations_results,
-            ep_lengths=self.evaluations_length,
-            costs=self.evaluations_costs,
-            **successes,  # type: ignore[arg-type]
-        )
-        os.replace(f"{self.log_path}.tmp.npz", f"{self.log_path}.npz")
+        with atomic_write(Path(f"{self.log_path}.npz")) as file:
+            np.savez(
+                file,
+                timesteps=self.evaluations_timesteps,
+                results=self.evaluations_results,
+                ep_lengths=self.evaluations_length,
+                costs=self.evaluations_costs,
+                **successes,  # type: ignore[arg-type]
+            )
 
     def _log(self, evaluation: TeamEvaluation) -> None:
         self.last_mean_reward = evaluation.mean_return

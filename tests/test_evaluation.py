@@ -254,6 +254,22 @@ class TestCallback:
         assert np.allclose(arrays["costs"][..., 1], 2 * arrays["costs"][..., 0])
         assert callback.last_mean_reward == arrays["results"][-1].mean()
 
+    def test_a_file_that_cannot_be_written_to_its_end_leaves_the_one_before(
+        self, tmp_path, monkeypatch
+    ):
+        callback = self.train(tmp_path)
+        before = (tmp_path / "evaluations.npz").read_bytes()
+
+        def half(file, **_):
+            file.write(before[:100])
+            raise OSError("no space left")
+
+        monkeypatch.setattr(np, "savez", half)
+        with pytest.raises(OSError, match="no space"):
+            callback.write_evaluations()
+        assert sorted(os.listdir(tmp_path)) == ["best", "evaluations.npz"]
+        assert (tmp_path / "evaluations.npz").read_bytes() == before
+
     def test_what_is_logged(self, tmp_path):
         self.train(tmp_path, cost_limits=[-0.0, 1e9])
         (step, log), _ = self.evaluations()
