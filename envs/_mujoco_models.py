@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from sb3_e2c.envs._mujoco_config import RobotConfig
-from sb3_e2c.envs._mujoco_hazards import BOMB_START, WALL_OFFSET
+from sb3_e2c.envs._mujoco_hazards import BOMB_START, SLOPE, WALL_OFFSET
 from sb3_e2c.envs._mujoco_import import mujoco
 
 STOCK_XML = {"Ant": "ant.xml", "HalfCheetah": "half_cheetah.xml"}
@@ -160,24 +160,27 @@ def _require(root: ET.Element, path: str) -> ET.Element:
 
 
 def _add_corridor(root: ET.Element, walls: str) -> None:
-    """Three pairs of boxes 40 m long; free ones weigh nothing and fall over when touched."""
+    """Three pairs of boxes 40 m long; free ones weigh nothing and fall over when touched.
+
+    Where the original's walls end, its cost goes on straight ahead: there visual ones do, too.
+    """
     world = _require(root, "worldbody")
-    _require(world, "geom[@name='floor']").attrib.update(pos="30 0 0", size="70 25 40")
+    _require(world, "geom[@name='floor']").attrib.update(pos="30 0 0", size="300 60 40")
     if walls == "none":
         return
-    for number in range(6):
-        piece, side = divmod(number, 2)
-        pose = {
-            "pos": f"{40 * piece} {WALL_OFFSET * (1 - 2 * side)} 1",
-            "euler": f"0 0 {-30 if piece == 1 else 30}",
-        }
-        box = {"name": f"wall{number + 1}", "type": "box", "size": "20 0.01 0.7"}
-        if walls == "visual":
-            ET.SubElement(world, "geom", pose | box | _NO_CONTACT, rgba=_WALL_COLOR)
-            continue
-        body = ET.SubElement(world, "body", pose)
-        ET.SubElement(body, "freejoint")
-        ET.SubElement(body, "geom", box, rgba=_WALL_COLOR, conaffinity="1", density="0.000001")
+    pieces = [(0, 0, 30), (40, 0, -30), (80, 0, 30)]
+    if walls == "visual":
+        pieces += [(40 * number, 20 * SLOPE, 0) for number in (3, 4, 5, 6)]
+    for number, (x, y, angle) in enumerate(pieces):
+        for side in (0, 1):
+            pose = {"pos": f"{x} {y + WALL_OFFSET * (1 - 2 * side)} 1", "euler": f"0 0 {angle}"}
+            box = {"name": f"wall{2 * number + side + 1}", "type": "box", "size": "20 0.01 0.7"}
+            if walls == "visual":
+                ET.SubElement(world, "geom", pose | box | _NO_CONTACT, rgba=_WALL_COLOR)
+                continue
+            body = ET.SubElement(world, "body", pose)
+            ET.SubElement(body, "freejoint")
+            ET.SubElement(body, "geom", box, rgba=_WALL_COLOR, conaffinity="1", density="0.000001")
 
 
 def _add_bomb(root: ET.Element, walls: str) -> None:
