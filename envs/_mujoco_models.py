@@ -168,7 +168,7 @@ def _add_corridor(root: ET.Element, walls: str) -> None:
     _require(world, "geom[@name='floor']").attrib.update(pos="30 0 0", size="300 60 40")
     if walls == "none":
         return
-    pieces = [(0, 0, 30), (40, 0, -30), (80, 0, 30)]
+    pieces = [(0, 0.0, 30), (40, 0.0, -30), (80, 0.0, 30)]
     if walls == "visual":
         pieces += [(40 * number, 20 * SLOPE, 0) for number in (3, 4, 5, 6)]
     for number, (x, y, angle) in enumerate(pieces):
