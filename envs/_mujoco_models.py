@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib.resources import files
+from itertools import product
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -171,16 +172,15 @@ def _add_corridor(root: ET.Element, walls: str) -> None:
     pieces = [(0, 0.0, 30), (40, 0.0, -30), (80, 0.0, 30)]
     if walls == "visual":
         pieces += [(40 * number, 20 * SLOPE, 0) for number in (3, 4, 5, 6)]
-    for number, (x, y, angle) in enumerate(pieces):
-        for side in (0, 1):
-            pose = {"pos": f"{x} {y + WALL_OFFSET * (1 - 2 * side)} 1", "euler": f"0 0 {angle}"}
-            box = {"name": f"wall{2 * number + side + 1}", "type": "box", "size": "20 0.01 0.7"}
-            if walls == "visual":
-                ET.SubElement(world, "geom", pose | box | _NO_CONTACT, rgba=_WALL_COLOR)
-                continue
-            body = ET.SubElement(world, "body", pose)
-            ET.SubElement(body, "freejoint")
-            ET.SubElement(body, "geom", box, rgba=_WALL_COLOR, conaffinity="1", density="0.000001")
+    for number, ((x, y, angle), side) in enumerate(product(pieces, (1, -1)), start=1):
+        pose = {"pos": f"{x} {y + side * WALL_OFFSET} 1", "euler": f"0 0 {angle}"}
+        box = {"name": f"wall{number}", "type": "box", "size": "20 0.01 0.7"}
+        if walls == "visual":
+            ET.SubElement(world, "geom", pose | box | _NO_CONTACT, rgba=_WALL_COLOR)
+            continue
+        body = ET.SubElement(world, "body", pose)
+        ET.SubElement(body, "freejoint")
+        ET.SubElement(body, "geom", box, rgba=_WALL_COLOR, conaffinity="1", density="0.000001")
 
 
 def _add_bomb(root: ET.Element, walls: str) -> None:

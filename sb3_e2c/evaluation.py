@@ -326,13 +326,14 @@ class TeamEvalCallback(EvalCallback):
         """Write ``evaluations.npz`` from all evaluations so far; nothing without ``log_path``."""
         if self.log_path is None:
             return
+        target = Path(f"{self.log_path}.npz")
         if not self.evaluations_timesteps:
-            Path(f"{self.log_path}.npz").unlink(missing_ok=True)
+            target.unlink(missing_ok=True)
             return
         successes = {}
         if self.evaluations_successes:
             successes = {"successes": self.evaluations_successes}
-        with atomic_write(Path(f"{self.log_path}.npz")) as file:
+        with atomic_write(target) as file:
             np.savez(
                 file,
                 timesteps=self.evaluations_timesteps,
