@@ -14,10 +14,9 @@ def atomic_write(target: Path) -> Iterator[BinaryIO]:
 
     A crash at any moment leaves the old file, or the new one, never a part of it.
 
-    :param target: Name of the file; its folder is made if needed; a link stays one
+    :param target: Name of the file; its folder is made if needed
     :return: A context with the open binary file
     """
-    target = target.resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:

@@ -451,12 +451,6 @@ class TestSaving:
         assert (tmp_path / "model.zip").read_bytes() == before
         assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
 
-    def test_saving_onto_a_link_writes_the_file_that_it_names(self, tmp_path):
-        (tmp_path / "latest.zip").symlink_to("model.zip")
-        make().save(tmp_path / "latest.zip")
-        assert (tmp_path / "latest.zip").is_symlink()
-        assert zipfile.is_zipfile(tmp_path / "model.zip")
-
     def test_checkpoints_are_whole_archives(self, tmp_path):
         make().learn(64, callback=CheckpointCallback(save_freq=8, save_path=str(tmp_path)))
         names = sorted(path.name for path in tmp_path.iterdir())
