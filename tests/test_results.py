@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_e2c.zoo import enjoy
-from sb3_e2c.zoo.report import number, percent, plus_minus, summary_table
+from sb3_e2c.zoo.report import comparison_table, number, percent, plus_minus, summary_table
 from sb3_e2c.zoo.results import final_numbers, find_results
 from sb3_e2c.zoo.suite import read_suite
 
@@ -85,6 +85,30 @@ def short_cell(name, env, method):
     return f"{reward} / {number(row['cost_mean'], 1)}{within}"
 
 
+@cache
+def comparisons(name, experiment):
+    """All tests of an experiment, by task, method, baseline and measure."""
+    definition, results = suite(name)
+    (found,) = [each for each in definition.experiments if each.id == experiment]
+    mine = [each for each in results if each.label in found.methods and each.env in found.envs]
+    table = comparison_table(found, final_numbers(mine))
+    names = {key: method.name for key, method in definition.methods.items()}
+    table = table.replace({"label": names, "baseline": names})
+    return table.set_index(["env", "label", "baseline", "measure"])
+
+
+def row_of_tests(memory, experiment, task, methods, measure):
+    """The cells of a table of tests: both means, and p before and after the adjustment."""
+    name = "paper" if memory == "yes" else "paper_mlp"
+    env, (method, baseline) = task.strip("`"), methods.split(" / ")
+    measure = {"reward": "return"}.get(measure, measure)
+    row = comparisons(name, experiment).loc[(env, method, baseline, measure)]
+    means = [statistics(name, env, each).loc["sampled"] for each in (method, baseline)]
+    places = 1 if measure == "cost" else digits(means[0]["return_mean"])
+    both = " / ".join(number(each[f"{measure}_mean"], places) for each in means)
+    return [both, *(f"{p:.2g}" for p in (row["welch"], row["welch_holm"]))]
+
+
 def same(printed, expected):
     """Whether two texts differ by one unit of their numbers' last decimals at most."""
     decimal = r"-?\d+\.\d+"
@@ -129,6 +153,17 @@ def test_the_tables_of_the_page_are_those_of_the_results(name, env, method, cell
     if cells:
         expected = expected(name, env, method)
         assert same(str(cells), str(expected)), f"expected {expected}"
+
+
+TESTS = [
+    row for header, rows in tables(PAGE) if header[:2] == ["memory", "experiment"] for row in rows
+]
+
+
+@pytest.mark.parametrize("row", TESTS, ids=lambda row: " ".join(row[:5]))
+def test_the_tests_of_the_page_are_those_of_the_results(row):
+    expected = row_of_tests(*row[:5])
+    assert row[5:] == expected, f"expected {expected}"
 
 
 def test_the_tables_are_found():
