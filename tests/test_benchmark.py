@@ -456,8 +456,19 @@ def test_a_job_that_another_process_holds_is_done_later(run_fake, place):
 
 def test_finished_jobs_with_other_settings_are_refused(suite_file, place, capsys):
     write_json(place.done, {"config": {**place.job.configuration(), "gamma": 0.5}})
+    write_json(place.results / "evaluation.json", {})
     line = refusal(capsys, ["--suite", suite_file, "-f", place.folder])
     assert "gamma: 0.5, now 0.9" in line
+
+
+@pytest.mark.parametrize("name", ["run.json", "evaluation.json"])
+def test_a_damaged_result_is_named_with_what_to_do(name, suite_file, place, capsys):
+    write_json(place.done, {"config": place.job.configuration()})
+    write_json(place.results / "evaluation.json", {})
+    (place.results / name).write_text("{")
+    line = refusal(capsys, ["--suite", suite_file, "-f", place.folder])
+    assert f"cannot read {place.results / name}" in line
+    assert f"remove {place.results} and run the benchmark again" in line
 
 
 def test_a_dry_run_only_lists(suite_file, tmp_path, capsys):

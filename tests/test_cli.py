@@ -5,9 +5,12 @@ import os
 import re
 import shlex
 import subprocess
+import sys
 from argparse import Namespace
 
 import pytest
+
+import sb3_e2c
 
 pytest.importorskip("rl_zoo3")
 
@@ -135,3 +138,26 @@ def test_zsh_takes_the_same_script_after_a_preamble(bash_script):
 def test_completion_knows_every_command(capsys):
     cli.main(["completion", "bash"])
     assert f'1:*) words="{" ".join(cli.COMMANDS)}"' in capsys.readouterr().out
+
+
+def test_help_needs_no_torch():
+    code = "import sys; from sb3_e2c.zoo import cli; cli.main([]); assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_ctrl_c_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
+    def interrupted(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["plot"])
+    assert exit_.value.code == 130
+    assert capsys.readouterr().err == "sb3-e2c: interrupted\n"
+
+
+def test_every_public_name_is_found():
+    for name in sb3_e2c.__all__:
+        assert getattr(sb3_e2c, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = sb3_e2c.nothing

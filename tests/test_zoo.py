@@ -755,7 +755,9 @@ def test_enjoy_reports_the_team(trained, capsys):
     assert result["deterministic"] is False
     assert (result["seed"], result["algo"], result["env"]) == (1_000_000, "e2c_t", ENV)
     assert Path(result["model"]) == run_folder(trained) / f"{ENV}.zip"
-    assert "sampled actions" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "sampled actions" in text
+    assert f"{ENV}.zip (--preset {result['preset']})" in text
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -892,7 +894,7 @@ def test_enjoy_films_one_episode(trained, tmp_path, suffix):
         (["--env", "MultiRover-6-33-v0"], "did you mean 'MultiRover-6-3-v0'"),
         (["--algo", "e2ct"], "did you mean 'e2c_t'"),
         (["--algo", "mappo"], "sb3-e2c train --algo mappo"),
-        (["--exp-id", "7"], f"{ENV}_7"),
+        (["--exp-id", "7"], f"{ENV}_7 was not found; there are --exp-id 1; train one"),
         (["--load-checkpoint", "7"], "rl_model_7_steps.zip"),
         (["--load-checkpoint", "7"], f"checkpoints there: {ROLLOUT}, {2 * ROLLOUT}"),
         (["--n-episodes", "0"], "--n-episodes is 0"),

@@ -35,7 +35,7 @@ from sb3_e2c.zoo.console import (
 )
 from sb3_e2c.zoo.jobs import BUSY, Outcome
 from sb3_e2c.zoo.pools import LocalPool, Pool, RayPool
-from sb3_e2c.zoo.results import Place, read_json
+from sb3_e2c.zoo.results import Place, advice, read_json
 from sb3_e2c.zoo.suite import Job, check_methods, find_suite, read_suite, suite_names, suite_text
 
 _MOST_SEEDS = 10_000  # of a range: more is a slip of the hand
@@ -238,13 +238,15 @@ def _number(value: Any) -> str:
 
 
 def check_settings(place: Place, config: dict[str, Any]) -> None:
-    """Refuse to count a finished job with other settings as this one.
+    """Refuse to count a finished job with other settings as this one, or one that is damaged.
 
     :param place: Where the job lies
     :param config: Its settings now
     :raises UserError: naming what has changed
     """
-    then = read_json(place.done).get("config", {})
+    with advice(place.results):
+        then = read_json(place.done).get("config", {})
+        read_json(place.results / "evaluation.json")
     changed = sorted(key for key in then if then[key] != config.get(key))
     if changed:
         key = changed[0]

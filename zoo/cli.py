@@ -4,8 +4,6 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from sb3_e2c.zoo.console import fail, unknown
-
 COMMANDS = {
     "train": "train a team",
     "enjoy": "evaluate a trained team",
@@ -29,12 +27,20 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     :param argv: The command and its flags; default: those of this process
     """
-    command, *flags = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    try:
+        _run(*(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt:  # while it imports its libraries; later a command takes care itself
+        print("sb3-e2c: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def _run(command: str = "--help", *flags: str) -> None:
     if command in ("-h", "--help"):
         print("usage: sb3-e2c COMMAND [FLAGS]; COMMAND --help shows its flags and examples\n")
         print("\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items()))
     elif command not in COMMANDS:
-        fail(unknown("command", command, COMMANDS))
+        console = importlib.import_module("sb3_e2c.zoo.console")
+        console.fail(console.unknown("command", command, COMMANDS))
     else:
         importlib.import_module(f"sb3_e2c.zoo.{command}").main(flags)
 

@@ -127,6 +127,7 @@ def summarize(run: Run, model: MAPPO, result: TeamEvaluation, **settings: Any) -
         "algo": run.algo,
         "env": run.env_id,
         "model": str(run.model_path),
+        "preset": run.flags.get("preset"),
         "episodes": len(result.returns),
         **settings,
         "team_return": float(result.returns.mean()),
@@ -164,7 +165,8 @@ def report(summary: dict[str, Any]) -> str:
 def _heading(summary: dict[str, Any]) -> str:
     actions = "most likely actions" if summary["deterministic"] else "sampled actions"
     episodes = f"{summary['episodes']} episodes of the team, {actions}, seed {summary['seed']}"
-    return f"{summary['model']}\n{episodes}"
+    preset = f" (--preset {summary['preset']})" if summary["preset"] else ""
+    return f"{summary['model']}{preset}\n{episodes}"
 
 
 def _table(summaries: list[dict[str, Any]]) -> str:

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from sb3_e2c.zoo.aggregate import (
     bootstrap_interval,
@@ -34,6 +35,7 @@ _DASHES: tuple[tuple[float, ...], ...] = (
     *((10, 4), (1, 3), (8, 1.5, 1.5, 1.5, 1.5, 1.5)),
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
+_LETTERS = 4.5  # of a legend's name, for each inch of the figure, so that two stand side by side
 _LIMIT: dict[str, Any] = {"color": "#444444", "linestyle": (0, (1, 1)), "linewidth": 1.2}
 
 
@@ -115,7 +117,10 @@ def draw_curves(
             axes.set_ylabel(_words(column))
             tidy(axes)
         row[0].set_title(env, loc="left", fontweight="bold")
-    _legend(figure, experiment.methods, look, limit=bool(costs))
+        counts = [len(shown(groups.get((env, label), ()))) for label in experiment.methods]
+        row[0].set_title(_seeds(counts), loc="right", fontsize="small", color="#444444")
+    drawn = [label for label in experiment.methods if _all_envs(label, envs, groups)]
+    _legend(figure, drawn, look, limit=bool(costs))
     return figure
 
 
@@ -131,13 +136,26 @@ def _all(
     return [result for label in labels for result in shown(groups.get((env, label), ()))]
 
 
+def _all_envs(
+    label: str, envs: Sequence[str], groups: Mapping[tuple[str, str], Sequence[Result]]
+) -> list[Result]:
+    return [result for env in envs for result in shown(groups.get((env, label), ()))]
+
+
+def _seeds(counts: Sequence[int]) -> str:
+    """How many seeds the lines of one row are means of."""
+    least, most = min(n for n in counts if n), max(counts)
+    span = str(most) if least == most else f"{least} to {most}"
+    return f"{span} seed" if most == 1 else f"{span} seeds"
+
+
 def _cost_names(results: Sequence[Result]) -> list[str]:
     names = {name: None for each in results if each.curve is not None for name in each.curve}
     return [name for name in names if name.startswith("cost")]
 
 
 def _words(column: str) -> str:
-    kind, _, number = column.partition("_")
+    kind, _, number = column.replace("return", "reward").partition("_")
     return f"team {kind} {number}".strip()
 
 
@@ -177,7 +195,11 @@ def _legend(figure: Figure, labels: Sequence[str], look: Look, limit: bool) -> N
     if limit:
         handles.append(Line2D([], [], **_LIMIT))
         names.append("limit of the team's cost")
-    figure.legend(handles, names, loc="outside upper center", ncols=2, frameon=False)
+    fits = max(map(len, names)) <= _LETTERS * figure.get_figwidth()
+    columns = 2 if fits else 1
+    figure.legend(
+        *(handles, names), loc="outside upper center", ncols=columns, frameon=False, handlelength=4
+    )
 
 
 def draw_finals(experiment: Experiment, finals: pd.DataFrame, look: Look) -> Figure | None:
@@ -193,13 +215,14 @@ def draw_finals(experiment: Experiment, finals: pd.DataFrame, look: Look) -> Fig
     if not envs:
         return None
     columns = [name for name in ours if name == "return" or name.startswith("cost")]
-    height = 0.33 * len(experiment.methods) + 0.9
+    methods = [label for label in experiment.methods if (ours["label"] == label).any()]
+    height = 0.33 * len(methods) + 0.9
     figure, table = _grid(len(envs), len(columns), row_height=height)
     for row, env in zip(table, envs, strict=True):
         for axes, column in zip(row, columns, strict=True):
-            _draw_final(axes, ours[ours["env"] == env], column, experiment.methods, look)
+            _draw_final(axes, ours[ours["env"] == env], column, methods, look)
         row[0].set_title(env, loc="left", fontweight="bold")
-        row[0].set_yticks(range(len(experiment.methods)), map(look.name, experiment.methods))
+        row[0].set_yticks(range(len(methods)), map(look.name, methods))
     return figure
 
 
@@ -216,6 +239,7 @@ def _draw_final(
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_yticks([])
     axes.set_xlabel(_words(column))
+    axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.margins(x=0.08)
     axes.grid(axis="x", alpha=0.25)
     axes.spines[["top", "right", "left"]].set_visible(False)

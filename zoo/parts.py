@@ -9,10 +9,8 @@ import torch as th
 from stable_baselines3.common import torch_layers
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_e2c
-from sb3_e2c import MAPPO, OEMRewardCallback
+from sb3_e2c import MAPPO, OEMRewardCallback, multipliers
 from sb3_e2c.callbacks import ESTIMATORS
-from sb3_e2c.multipliers import Multipliers
 from sb3_e2c.zoo.console import unknown
 
 
@@ -33,7 +31,7 @@ def classes_in(module: ModuleType, base: type) -> dict[str, type]:
 # key: the classes that it may name. Names are looked up here and nowhere else.
 CLASSES: dict[str, Mapping[str, type]] = {
     "policy": MAPPO.policy_aliases,
-    "multipliers_class": classes_in(sb3_e2c, Multipliers),
+    "multipliers_class": classes_in(multipliers, multipliers.Multipliers),
     "estimator": ESTIMATORS,
     "activation_fn": classes_in(th.nn, th.nn.Module),
     "optimizer_class": classes_in(th.optim, th.optim.Optimizer),

@@ -126,6 +126,7 @@ def plot_suite(folder: Path, out: Path) -> Path:
         pictures = _pictures(experiment, data, finals, out)
         if not pictures:
             continue
+        print(f"{folder.name}: {experiment.id}", file=sys.stderr)
         heading = f"{experiment.figure}: {experiment.title}"
         page += [html_text("h2", heading), *pictures]
         text += [f"\n## {heading}"]

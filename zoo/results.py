@@ -12,7 +12,8 @@ They are all that ``plot`` needs, and small enough to be committed::
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -103,7 +104,7 @@ def read_table(path: Path, **options: Any) -> pd.DataFrame:
     except (OSError, ValueError) as error:  # EmptyDataError is a ValueError
         raise UserError(f"cannot read {path}: {error}") from None
     if table.empty:
-        raise UserError(f"{path} is empty; has the run finished an episode?")
+        raise UserError(f"{path} has no rows; has the run finished an episode?")
     return table
 
 
@@ -195,6 +196,18 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
+@contextmanager
+def advice(folder: Path) -> Iterator[None]:
+    """Say what to do about a damaged file of a job.
+
+    :param folder: Of the job's small files
+    """
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{error}; remove {folder} and run the benchmark again") from None
+
+
 @dataclass(frozen=True)
 class Result:
     """What a job has left.
@@ -214,17 +227,20 @@ class Result:
     def curve(self) -> pd.DataFrame | None:
         """Its learning curve so far; None if no episode has finished."""
         path = self.folder / "curve.csv"
-        return read_table(path) if path.is_file() else None
+        with advice(self.folder):
+            return read_table(path) if path.is_file() else None
 
     @cached_property
     def evaluation(self) -> dict[str, Any] | None:
         """Its evaluations by mode; None if it has not finished."""
-        return read_json(self.folder / "evaluation.json") if self.finished else None
+        with advice(self.folder):
+            return read_json(self.folder / "evaluation.json") if self.finished else None
 
     @cached_property
     def record(self) -> dict[str, Any]:
         """How it came about; empty if it has not finished."""
-        return read_json(self.folder / "run.json") if self.finished else {}
+        with advice(self.folder):
+            return read_json(self.folder / "run.json") if self.finished else {}
 
     @cached_property
     def failed(self) -> bool:

@@ -3,7 +3,8 @@
 import re
 import shlex
 from argparse import ArgumentParser, Namespace
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ class Run:
     :param folder: The run's folder
     :param model_path: The model's zip file
     :param config: What it was trained with, see :func:`sb3_e2c.zoo.configuration.resolve`
+    :param flags: Of the command that trained it
     """
 
     algo: str
@@ -44,6 +46,7 @@ class Run:
     folder: Path
     model_path: Path
     config: dict[str, Any]
+    flags: Mapping[str, Any] = field(default_factory=dict)
 
 
 def add_run_flags(parser: ArgumentParser) -> None:
@@ -97,8 +100,10 @@ def find_run(args: Namespace) -> Run:
     number = args.exp_id or latest_run_id(logs, args.env)
     folder = logs / f"{args.env}_{number}" if number > 0 else logs
     if not folder.is_dir():
+        numbers = run_ids(logs, args.env)
+        there = f"there are --exp-id {brief(', '.join(map(str, numbers)))}; " if numbers else ""
         raise UserError(
-            f"{folder} was not found; train one with: sb3-e2c train --algo {args.algo} "
+            f"{folder} was not found; {there}train one with: sb3-e2c train --algo {args.algo} "
             f"--env {args.env} -f {shlex.quote(args.folder)}"
         )
     model_path = folder / _model_name(args, folder)
@@ -110,13 +115,22 @@ def find_run(args: Namespace) -> Run:
 def latest_run_id(logs: Path, env_id: str) -> int:
     """Number of the latest run; 0 if there is none.
 
-    Not RL-Zoo's, which finds nothing in folders whose names have brackets.
+    :param logs: The folder of an algorithm's runs
+    :param env_id: The environment
+    """
+    return max(run_ids(logs, env_id), default=0)
+
+
+def run_ids(logs: Path, env_id: str) -> list[int]:
+    """Numbers of the runs of an environment, in order.
+
+    Not RL-Zoo's function, which finds nothing in folders whose names have brackets.
 
     :param logs: The folder of an algorithm's runs
     :param env_id: The environment
     """
     found = (re.fullmatch(rf"{re.escape(env_id)}_(\d+)", path.name) for path in logs.glob("*"))
-    return max((int(match[1]) for match in found if match), default=0)
+    return sorted(int(match[1]) for match in found if match)
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
@@ -172,14 +186,12 @@ def open_run(folder: Path, algo: str, env_id: str, model_path: Path | None = Non
     :raises UserError: if it belongs to something else, or its files are broken
     """
     config = read_yaml(folder / env_id / "config.yml")
-    trained_with = read_yaml(folder / env_id / "args.yml")
+    flags = read_yaml(folder / env_id / "args.yml")
     for name, asked in (("algo", algo), ("env", env_id)):
-        if trained_with.get(name) != asked:
-            raise UserError(
-                f"{folder} was trained with --{name} {trained_with.get(name)}, not {asked}"
-            )
+        if flags.get(name) != asked:
+            raise UserError(f"{folder} was trained with --{name} {flags.get(name)}, not {asked}")
     check(algo, config)
-    return Run(algo, env_id, folder, model_path or folder / f"{env_id}.zip", config)
+    return Run(algo, env_id, folder, model_path or folder / f"{env_id}.zip", config, flags)
 
 
 def make_env(
