@@ -245,7 +245,7 @@ def test_results_are_those_of_enjoy(trained, published, tmp_path):
 def test_the_card_tells_the_hub_the_results(published):
     results = json.loads((published / "results.json").read_text())
     about = ModelCard.load(published / "README.md").data
-    assert about.library_name == "stable-baselines3"
+    assert about.to_dict()["library_name"] == "stable-baselines3"
     assert {ENV, "reinforcement-learning", "sb3-e2c"} <= set(about.tags)
     metrics = {each.metric_type: each for each in about.eval_results}
     reward, error = results["team_return"], results["team_return_se"]

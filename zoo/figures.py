@@ -119,7 +119,9 @@ def draw_curves(
         row[0].set_title(env, loc="left", fontweight="bold")
         counts = [len(shown(groups.get((env, label), ()))) for label in experiment.methods]
         row[0].set_title(_seeds(counts), loc="right", fontsize="small", color="#444444")
-    drawn = [label for label in experiment.methods if _all_envs(label, envs, groups)]
+    drawn = [
+        label for label in experiment.methods if any(_all(env, [label], groups) for env in envs)
+    ]
     _legend(figure, drawn, look, limit=bool(costs))
     return figure
 
@@ -134,12 +136,6 @@ def _all(
     env: str, labels: Sequence[str], groups: Mapping[tuple[str, str], Sequence[Result]]
 ) -> list[Result]:
     return [result for label in labels for result in shown(groups.get((env, label), ()))]
-
-
-def _all_envs(
-    label: str, envs: Sequence[str], groups: Mapping[tuple[str, str], Sequence[Result]]
-) -> list[Result]:
-    return [result for env in envs for result in shown(groups.get((env, label), ()))]
 
 
 def _seeds(counts: Sequence[int]) -> str:
@@ -195,11 +191,9 @@ def _legend(figure: Figure, labels: Sequence[str], look: Look, limit: bool) -> N
     if limit:
         handles.append(Line2D([], [], **_LIMIT))
         names.append("limit of the team's cost")
-    fits = max(map(len, names)) <= _LETTERS * figure.get_figwidth()
-    columns = 2 if fits else 1
-    figure.legend(
-        *(handles, names), loc="outside upper center", ncols=columns, frameon=False, handlelength=4
-    )
+    columns = 2 if max(map(len, names)) <= _LETTERS * figure.get_figwidth() else 1
+    style: dict[str, Any] = {"ncols": columns, "handlelength": 4, "frameon": False}
+    figure.legend(handles, names, loc="outside upper center", **style)
 
 
 def draw_finals(experiment: Experiment, finals: pd.DataFrame, look: Look) -> Figure | None:
