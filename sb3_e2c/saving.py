@@ -14,9 +14,15 @@ def atomic_write(target: Path) -> Iterator[BinaryIO]:
 
     A crash at any moment leaves the old file, or the new one, never a part of it.
 
-    :param target: Name of the file; its folder is made if needed
+    :param target: Name of the file, or of a link to it; its folder is made if needed. A pipe or a
+        device (``/dev/stdout``) is written to as it is
     :return: A context with the open binary file
     """
+    if target.exists() and not target.is_file():
+        with open(target, "wb") as file:
+            yield file
+        return
+    target = target.resolve()  # a link stays one
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:

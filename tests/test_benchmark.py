@@ -423,7 +423,10 @@ def test_an_unknown_environment_spoils_only_its_own_jobs(run_fake, suite_file, c
     assert exit_.value.code == 1
     shown = capsys.readouterr()
     assert "4/4 jobs done" in shown.out
-    assert "Nowhere-v0/small/seed_0 and 3 more: unknown environment" in shown.err
+    at_once, at_the_end = shown.err.split("4 jobs failed:")
+    reason = "Nowhere-v0/small/seed_0 and 3 more: unknown environment"
+    assert f"cannot run: {reason}" in at_once
+    assert reason in at_the_end
 
 
 def test_ctrl_c_stops_the_jobs_and_says_how_to_go_on(run_fake, capsys):

@@ -358,6 +358,8 @@ def benchmark(args: argparse.Namespace) -> list[Outcome]:
     write_whole(args.folder / "results" / suite.name / "suite.yml", suite_text(path))
     for outcome in refused:
         jobs.record_failure(outcome.place, outcome.status, [outcome.message])
+    for line in _by_message(refused):  # now, not only after hours
+        print(f"cannot run: {line}", file=sys.stderr, flush=True)
     progress = Progress(lengths, failed=list(refused))
     with _sigterm_as_ctrl_c(), closing(_make_pool(args)) as pool:
         print(progress.line(), flush=True)
