@@ -16,6 +16,7 @@ from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.pool import NullPool
 
 from sb3_e2c.zoo.configuration import check_algo, check_env, merge
 from sb3_e2c.zoo.console import UserError, brief
@@ -160,16 +161,18 @@ def open_storage(storage: str | None, folder: Path) -> BaseStorage:
         raise UserError(f"--storage {text}: expected sqlite:///{text} (a database) or a .log file")
     try:
         if "://" in text:
-            return RDBStorage(text, engine_kwargs=_patience(text))
+            return RDBStorage(text, engine_kwargs=_engine_kwargs(text))
         Path(text).parent.mkdir(parents=True, exist_ok=True)
         return JournalStorage(JournalFileBackend(text))
     except Exception as error:  # drivers that are missing, servers that refuse, foreign files
         raise UserError(f"--storage {text}: {brief(error)}") from error
 
 
-def _patience(url: str) -> dict[str, Any]:
-    """SQLite gives up after 5 seconds if others are writing."""
-    return {"connect_args": {"timeout": 60}} if url.startswith("sqlite") else {}
+def _engine_kwargs(url: str) -> dict[str, Any]:
+    """SQLite gives up after 5 seconds if others are writing, and nobody would close a pool."""
+    if not url.startswith("sqlite"):
+        return {}
+    return {"connect_args": {"timeout": 60}, "poolclass": NullPool}
 
 
 def load_study(storage: str | None, name: str, log_folder: str | Path) -> optuna.Study:
