@@ -192,6 +192,21 @@ def test_numbers_are_the_same_up_to_their_last_digit():
     assert not same("-51.2", "51.2")
 
 
+def test_the_long_evaluations_are_those_that_the_page_quotes():
+    folder = ROOT / "results" / "evaluations" / "best_rover" / "MultiRover-6-4-v0"
+    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("seed_*.json"))]
+    assert [run["episodes"] for run in runs] == 5 * [2000]
+    returns, costs = (
+        np.array([run[name] for run in runs]) for name in ("team_return", "team_cost")
+    )
+    errors = [np.std(numbers, ddof=1) / np.sqrt(5) for numbers in (returns, costs)]
+    sentence = (
+        f"{returns.mean():.3f} ± {errors[0]:.3f} at {costs.mean():.1f} ± {errors[1]:.1f} "
+        f"({', '.join(f'{number:.2f}' for number in returns)}; {(costs <= 20).sum()} of 5 within"
+    )
+    assert sentence in (ROOT / "docs" / "results.md").read_text()
+
+
 TEAMS = sorted((ROOT / "results" / "models").glob("*/*_*"))
 
 
