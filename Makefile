@@ -40,7 +40,7 @@ commit-checks: format type lint
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	-$(BIN)/python -m pip install --quiet --timeout 15 --retries 1 "pip >= 24.2"  # older ones search for ever without pins
+	-$(BIN)/python -m pip install --quiet --timeout 15 --retries 1 "pip >= 24.2, < 26"  # older: search for ever without pins; newer: not quiet
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[tests]"
 	touch $@
 
